@@ -209,5 +209,5 @@ def test_json_that_is_none_is_refused(tmp_path, monkeypatch, text):
 def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path):
     with (tmp_path / "a.json").open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(DataError, match="more than allowed"):
+    with pytest.raises(DataError, match="more than 64 MiB"):
         read_input_json(tmp_path / "a.json")

@@ -61,5 +61,5 @@ def test_numbers_on_their_bounds_and_none_are_allowed():
 
 @pytest.mark.parametrize("kind", [GaussNewton, MultipleShooting, SteepestDescent])
 def test_solvers_refuse_them_too(kind):
-    with pytest.raises(ConfigError, match="max_iterations = -3"):
+    with pytest.raises(ConfigError, match="max_iterations is -3"):
         kind(max_iterations=-3)

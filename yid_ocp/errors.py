@@ -71,7 +71,7 @@ class SolverError(YidError):
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
-    hint = "set, in this order, a smaller problem.time_step, a larger model.damping, other parameters.NAME.initial"
+    hint = "halve problem.time_step; if that does not help, double model.damping or change parameters.NAME.initial"
     what, allowed = f"the model cannot be simulated: {reason}", "settings for which every time step has a solution"
     return SolverError(what, where=where, allowed=allowed, hint=hint)
 
@@ -99,7 +99,7 @@ def import_optional(module: str, extra: str, what: str, kind: type[YidError] = D
 class OutputError(YidError):
     """An error that is raised when a result cannot be written to its destination."""
 
-    _usual_allowed = "a new name in a writable folder, on a disk with free space"
+    _usual_allowed = "a path in a writable folder, on a disk with free space"
     _usual_hint = "choose another path"
 
 
@@ -122,7 +122,7 @@ def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str
     The hint asks whether the most similar known name was meant. If no name is similar, it is `otherwise`.
     """
     names = [str(entry) for entry in known]
-    otherwise = otherwise or ("use one of the allowed names" if names else "leave it out")
+    otherwise = otherwise or (f"use an allowed name, such as '{names[0]}'" if names else f"leave '{name}' out")
     return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}
 
 

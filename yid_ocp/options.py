@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import operator
 import types
 from collections.abc import Callable, Iterable, Mapping
@@ -136,7 +137,15 @@ def check_option_bounds(options: Any, where: str) -> None:
     for name, option in class_options_by_key(kind).items():
         value = getattr(options, option.field_name)
         if not _within(option.type_hint, value):
-            raise ConfigError(f"{name} = {value} is out of range", where=where, allowed=describe_type(option.type_hint))
+            what, allowed = f"{name} is {value}, which is out of range", describe_type(option.type_hint)
+            raise ConfigError(what, where=where, allowed=allowed, hint=default_value_hint(name, option.default_value))
+
+
+def default_value_hint(key: str, default: Any) -> str:
+    """Return the advice to write the default of an option, to leave it out, or (if it is required) an allowed value."""
+    if isinstance(default, (int, float, str)):
+        return f"write an allowed value, such as the default {key}: {json.dumps(default)}"
+    return f"write an allowed value for {key}" + ("" if default is MISSING else f", or leave {key} out")
 
 
 def _within(hint: Any, value: Any) -> bool:

@@ -22,8 +22,8 @@ class Registry(Generic[_Entry]):
 
         def enter(entry: _Entry) -> _Entry:
             if name in self._entries:
-                what, allowed = f"another {self.entry_noun} already has the name '{name}'", "a new name"
-                hint = "register it under another name"
+                what, allowed = f"another {self.entry_noun} already has the name '{name}'", "a name that is not in use"
+                hint = f"register it under another name, such as '{name}_2'"
                 raise ConfigError(what, where=f"register('{name}')", allowed=allowed, hint=hint)
             self._entries[name] = entry
             return entry

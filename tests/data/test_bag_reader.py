@@ -206,7 +206,7 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     assert np.allclose(points.position[3], [[1.0, 0.0, 0.3], [0.0, 0.7, 0.3], [0.5, 0.0, 0.3]])
     left = [note for note in recording.notes if "was left out (" in note]
     assert [note.split()[0] for note in left] == ["/gripper/closed", *(f"/log/{name}" for name in "abcdef")]
-    assert left[0].endswith("(std_msgs/msg/Bool, 10)")
+    assert left[0].endswith("(std_msgs/msg/Bool, 10 messages)")
     assert any("orientations of /tf:middle, /vrpn/hand/pose" in note for note in recording.notes)
     write_recording(recording, tmp_path / "all.h5")
     assert read_any(tmp_path / "all.h5").notes == recording.notes
@@ -272,7 +272,7 @@ def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
     assert by_name["/left"].imported_as == "joints a"
     assert by_name["/left"].mean_rate == pytest.approx(100.0)
     assert by_name["/vrpn/hand/pose"].imported_as == "point hand"
-    assert "middle: --points /tf:FRAME" in by_name["/tf"].note
+    assert "middle. To use one: --points /tf:FRAME" in by_name["/tf"].note
     assert sum(not source.imported_as for source in contents.sources) == 8
     assert contents.reader_options["point_names"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
     assert read_any(path, **contents.reader_options).joint_names == ("a", "b")
@@ -400,4 +400,4 @@ def test_metadata_of_a_bag_that_take_long_are_refused(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap folder", arm_and_camera())
     with (path / "metadata.yaml").open("a") as file:
         file.write("more: [" + "1, " * 100_000 + "1]\n")
-    refused(path, "more than allowed")
+    refused(path, "more than 0.25 MiB")

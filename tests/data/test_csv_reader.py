@@ -130,23 +130,23 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
-    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no group", ""),
+    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no measurements", ""),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:JOINT"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),
-    "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "decimal commas and decimal points", ""),
-    "time of day": ("t,q_a\n10:20:30,1\n", {}, "'t' has the cell '10:20:30'", ""),
-    "no such day": ("t,q_a\n2025-13-04T10:20:30,1\n", {}, "'t' has the cell '2025-13", ""),
-    "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' has the cell 'fast'", ""),
+    "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "numbers with commas and numbers with points", ""),
+    "time of day": ("t,q_a\n10:20:30,1\n", {}, "the cell '10:20:30' in column 't' is not a number", ""),
+    "no such day": ("t,q_a\n2025-13-04T10:20:30,1\n", {}, "the cell '2025-13-04T10:20:30' in column 't'", ""),
+    "text": ("t,q_a\n0,1\n1,fast\n", {}, "the cell 'fast' in column 'q_a'", ""),
     "joint missing": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", "add the column"),
     "misspelt": ("t,q_elbwo,q_b,effort_elbow,effort_b\n0,1,1,1,1\n", {}, "for position of 'elbow'", "mean 'elbwo'?"),
     "no position": ("t,effort_a\n0,1\n", {}, "no column for position of 'a'", ""),
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
     "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "infinite value, the first of joint 'a' at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
-    "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg and in rad", ""),
+    "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg, others in rad", ""),
     "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),
     "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "meaning of column 'force_x'", ""),
     "unit of what": (GOOD, {"units": {"angle": "deg"}}, "'angle', which is not the name of a quantity", ""),
@@ -166,7 +166,7 @@ def test_csv_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
     absent = tmp_path / "absent.csv"
-    for file, message in ((path, "table in UTF-8"), (tmp_path, "this is a folder"), (absent, "no such file")):
+    for file, message in ((path, "table in UTF-8"), (tmp_path, "path is a folder"), (absent, "no such file")):
         with pytest.raises(DataError, match=message):
             READERS[".csv"](file)
     monkeypatch.setattr("csv.reader", Mock(side_effect=OSError(5, "any words")))
@@ -183,7 +183,7 @@ def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monk
     with file.open("a") as more:
         more.write("9,9\n")
     for read in (read_any, preview_file):
-        refused(file, "more than allowed", read)
+        refused(file, "million numbers, more than 0 million", read)
 
 
 def test_too_many_columns_and_a_line_without_end_are_refused_before_the_work(tmp_path: Path) -> None:

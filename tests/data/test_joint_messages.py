@@ -138,7 +138,7 @@ def test_the_wrench_that_a_driver_estimates_is_a_group_that_says_so(
     wanted = np.arange(30.0)[:, None] + np.arange(3.0)
     assert np.array_equal(group.values_by_quantity["force"][:, 0], wanted)
     assert np.array_equal(group.values_by_quantity["torque"][:, 0], wanted + 3)
-    assert any("use it in place of efforts" in note for note in recording.notes)
+    assert any("Use it in place of the efforts" in note for note in recording.notes)
 
 
 def test_the_state_of_a_ur_becomes_joints_of_its_usual_names(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_fields_of_any_message_become_joints_and_no_command_is_suggested_without
         ({"position": "/arm.state.p"}, "no field 'state.p'"),
         ({"position": "/arm.state.label"}, "is not numeric"),
         ({"position": "/hand.q"}, "no messages on the topic '/hand'"),
-        ({"position": "/arm"}, "names no field"),
+        ({"position": "/arm"}, "'position=/arm' names a topic, but no field"),
         ({"effort": "/arm.state.torque"}, "the channel position has no field"),
         ({"position": "/arm.state.q", "effect": "/arm.state.torque"}, "no joint channel 'effect'"),
     ):

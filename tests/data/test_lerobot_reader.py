@@ -135,13 +135,13 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
     [
         ({}, {"episode": 2}, "there is no episode 2"),
         ({}, {"episode": -1}, "there is no episode -1"),
-        ({"total_episodes": 9}, {"episode": 5}, "no file has this episode"),
+        ({"total_episodes": 9}, {"episode": 5}, "no file of the dataset has episode 5"),
         ({"codebase_version": "v1.6"}, {}, "has the version v1.6"),
-        ({"fps": 0}, {}, "fps = 0 is not allowed"),
-        ({"fps": "fast"}, {}, 'fps = "fast" is not allowed'),
+        ({"fps": 0}, {}, "fps is 0, which is not allowed"),
+        ({"fps": "fast"}, {}, 'fps is "fast", which is not allowed'),
         ({"features": {"action": {}}}, {}, "no observation.state"),
         ({}, {"joints": ["elbow"], "units": {"position": "deg"}}, "no joint 'elbow'"),
-        ({}, {"episode": 1}, "unit of the joint positions is unknown: the largest absolute value is 131"),
+        ({}, {"episode": 1}, "unit of the joint positions is unknown; the largest absolute value is 131"),
     ],
     ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
 )
@@ -196,7 +196,7 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
 def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
-    refused(path, "more than allowed")
+    refused(path, "million numbers, more than 0 million")
     (path / FIRST).write_bytes(b"PAR1 and no more")
     refused(path, "table of the episode cannot be read")
     monkeypatch.setitem(sys.modules, "pyarrow", None)

@@ -98,7 +98,7 @@ def with_straight(straight: np.ndarray, **changes: Any) -> Recording:
 
 
 INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
-    "no group": (lambda: Recording(), "no group"),
+    "no group": (lambda: Recording(), "no measurements"),
     "no samples": (lambda: with_joints(t=np.empty(0), position=np.empty((0, 2))), "no samples"),
     "no names": (lambda: with_joints(names=()), "no names"),
     "empty name": (lambda: with_joints(names=("a", "")), "'' cannot be used"),
@@ -138,9 +138,9 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "NaN joint std": (lambda: with_joints(velocity_std=np.array([0.1, np.nan])), "velocity_std is"),
     "negative bias": (lambda: with_joints(effort_bias_std=-0.1), "effort_bias_std is -0.1"),
     "shape of bias": (lambda: with_joints(effort_bias_std=np.ones(3)), r"shape \(3,\)"),
-    "kind of effort": (lambda: with_joints(effort_kind="average"), "the kind of the efforts is 'average'"),
+    "kind of effort": (lambda: with_joints(effort_kind="average"), "effort_kind is 'average', which is unknown"),
     "NaN pose": (lambda: with_camera(camera_pose=changed(np.eye(4), (0, 3), np.nan)), "value that is not finite"),
-    "last row": (lambda: with_camera(camera_pose=changed(np.eye(4), (3, 0), 1.0)), "last row of the pose"),
+    "last row": (lambda: with_camera(camera_pose=changed(np.eye(4), (3, 0), 1.0)), "the pose has the last row"),
     "scaled pose": (lambda: with_camera(camera_pose=np.diag([2.0, 2.0, 2.0, 1.0])), "not orthonormal"),
     "reflection": (lambda: with_camera(camera_pose=np.diag([1.0, 1.0, -1.0, 1.0])), "reflection"),
     "degrees": (lambda: with_joints(position=Q + 90.0), "'position' reaches 9"),
@@ -152,7 +152,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "millimetres": (lambda: with_camera(position=1e3 * CAMERA.position), "a coordinate reaches"),
     "straight without points": (lambda: with_straight(np.zeros((1, 3)), points=()), "but no group of points"),
     "straight of others": (lambda: with_straight(np.zeros((3, 3))), r"shape \(3, 3\)"),
-    "straight unseen": (lambda: with_straight(np.array([[0.0, np.nan, 0.0]])), "a position is not finite"),
+    "straight unseen": (lambda: with_straight(np.array([[0.0, np.nan, 0.0]])), "has a position that is not finite"),
     "straight in millimetres": (lambda: with_straight(np.array([[100.0, 0.0, 0.0]])), "a coordinate reaches 100 m"),
     "straight of a later group": (
         lambda: with_straight(np.zeros((3, 3)), points=BASE.points[::-1]),

@@ -126,18 +126,18 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     file.write_text(MODELS["arm with a gripper"].replace("</worldbody>", cube))
     mechanism = read_urdf(file)
     read_urdf(file)
-    assert caplog.text.count("motors: 1 ignored (except their limits") == 1
+    assert caplog.text.count("leaves out motors (1 in the file). Their limits are kept") == 1
     assert "actuators other" not in caplog.text
     assert "equalities" not in caplog.text  # the second finger follows the first
     assert "finger2" not in mechanism.joint_names
     assert [joint.effort_limit for joint in mechanism.joints[:2]] == [87, 40]
     assert mechanism.joints[0].upper_limit == 2.5
     assert {"tcp", "cube", "top"}.intersection(mechanism.frames) == {"tcp"}
-    assert "bodies of free objects: 1 ignored" in caplog.text
+    assert "leaves out bodies of free objects (1 in the file)" in caplog.text
     assert read_urdf(file, joints=["joint1", "joint2"]).joint_names == ("joint1", "joint2")
     file.write_text(MODELS["rail with references"])
     read_urdf(file)
-    assert "springs of joints: 1 ignored (set model.joint_springs)" in caplog.text
+    assert "leaves out springs of joints (1 in the file). To have them, set model.joint_springs" in caplog.text
 
 
 GRIPPER = """<body name="gripper" {at}>{free}<site name="palm" pos="0 0.02 0.01"/>

@@ -255,7 +255,7 @@ def test_deviations_are_those_of_repeats(efforts_of):
 
 
 def test_a_record_shorter_than_the_filter_is_refused(efforts_of):
-    with pytest.raises(DataError, match=r"(?s)6 s of efforts are too short.*more than 15\.4 s"):
+    with pytest.raises(DataError, match=r"(?s)6 s of joints.effort are too short.*more than 15\.4 s"):
         efforts_of(np.zeros((601, 2)), 0.5)
 
 

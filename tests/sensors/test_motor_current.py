@@ -113,10 +113,10 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     assert made.time_slice(1.0, 2.0).channel_groups[0].t[[0, -1]] == pytest.approx([1.0, 2.0])
     assert made.sensor_setting_keys == ("joints.effort", "joints.position", "motors_left.current")
     for change, message in (
-        (lambda file: file.create_group("motor"), "no group 'motor'"),
+        (lambda file: file.create_group("motor"), "unknown group, 'motor'"),
         (lambda file: file["motors_left"].create_dataset("voltage", data=T), "unknown dataset, 'voltage'"),
         (lambda file: file["motors_left"].attrs.update(voltage_std=1.0), "unknown attribute, 'voltage_std'"),
-        (lambda file: file["motors_left/current"].attrs.update(unit="mA"), "the unit of the dataset is 'mA'"),
+        (lambda file: file["motors_left/current"].attrs.update(unit="mA"), "the unit is 'mA', but must be 'A'"),
         (lambda file: file["motors_left"].__delitem__("t"), "the dataset 't' is missing"),
         (lambda file: file["motors_left"].__delitem__("current"), "the group has no dataset"),
     ):
@@ -148,16 +148,16 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
     ("options", "changes", "message"),
     [
         (SensorOptions(), {}, "motors' torque constants are not stated"),
-        (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
-        (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
-        (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "noise level of the motor currents"),
-        (KNOWN, {"names": ("elbow", "sholder")}, "joint 'sholder', which the model lacks"),
+        (SensorOptions(constants={"torque_constant": 0.0}), {}, "torque constant of joint 'shoulder' is zero"),
+        (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "'shoulder' has no value"),
+        (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "standard deviation of the noise of the motor currents"),
+        (KNOWN, {"names": ("elbow", "sholder")}, "'sholder', which is no joint of the model"),
         (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),
-        (KNOWN, {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}}, "0 s of efforts are too short"),
+        (KNOWN, {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}}, "0 s of motors_left.current are too short"),
         (
             KNOWN,
             {"t": T[:20], "values_by_quantity": {"current": np.zeros((20, 2))}},
-            r"0\.19 s of efforts are too short",
+            r"0\.19 s of motors_left.current are too short",
         ),
     ],
 )

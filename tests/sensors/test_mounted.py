@@ -271,7 +271,7 @@ def test_noise_of_encoders_is_noise_of_what_the_sensor_weighs(urdf: Path, record
     [
         ({}, {"names": ("hand",)}, "is on the frame 'hand', which does not exist"),
         ({"frame_by_recorded_name": {"lower": "base"}}, {}, "is on the frame 'base', which does not move"),
-        ({}, {"noise_and_bias_stds_by_attribute": {}}, "noise level of force is neither recorded nor in the settings"),
+        ({}, {"noise_and_bias_stds_by_attribute": {}}, "noise of force is neither recorded nor in the settings"),
         ({"constants": {"sign": 2.0}}, {}, "sign of wrist.force"),
     ],
 )

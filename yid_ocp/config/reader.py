@@ -79,7 +79,7 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
         data = CommentedMap()
     if not isinstance(data, CommentedMap):
         hint, allowed = "start with the file that `yid-ocp init` writes", "a mapping with sections such as `model:`"
-        raise ConfigError("the file contains no keys with values", where=origin, allowed=allowed, hint=hint)
+        raise ConfigError("the file has a list or a lone value, but no keys", where=origin, allowed=allowed, hint=hint)
     places: dict[_KeyPath, str] = {}
     return _unwrap(data, (), places, origin), places
 
@@ -97,7 +97,7 @@ class _CheckedParser(Parser):
         event = super().get_event()
         self._count += _ALIAS_COST + self._sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
         if self._count > _MAX_ENTRIES:
-            what = f"there are more than {_MAX_ENTRIES} entries, with aliases expanded"
+            what = f"the file has more than {_MAX_ENTRIES} entries, with every alias (*NAME) replaced by its content"
             raise self._odd(what, event, "remove entries or aliases")
         if isinstance(event, CollectionStartEvent):
             self._begun.append((event.anchor, self._count))
@@ -107,7 +107,7 @@ class _CheckedParser(Parser):
         if len(self._begun) > _MAX_DEPTH:
             raise self._odd(f"the entries are nested more than {_MAX_DEPTH} levels deep", event, "use fewer levels")
         if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
-            raise self._odd(f"the value has the tag '{event.tag}'", event, "remove the tag")
+            raise self._odd(f"the value has the tag '{event.tag}', but no tags are read", event, "remove the tag")
         return event
 
     def _odd(self, what: str, event: Any, hint: str) -> ConfigError:
@@ -129,15 +129,16 @@ def _loaded(text: str, origin: str) -> Any:
         raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
-        what, hint = "the file is not valid YAML", "remove numbers of thousands of digits, and keys that are lists"
+        what, hint = "the file is not valid YAML", "remove numbers of over 4000 digits, and keys that are lists"
         raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from error
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Convert the YAML reader's values to plain Python values, and store their lines in `places`."""
     if len(path) > _MAX_DEPTH:
-        allowed, hint = "aliases of other entries", "replace the aliases by their content"
-        raise ConfigError("an alias refers to itself", where=origin, allowed=allowed, hint=hint)
+        allowed, hint = "aliases of other entries", "replace the alias by the content that is meant"
+        what = "an alias (*NAME) stands within the entry to which it refers"
+        raise ConfigError(what, where=origin, allowed=allowed, hint=hint)
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():
@@ -153,7 +154,8 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
         what, allowed = "the text contains a null character", "text without null characters"
         raise ConfigError(what, where=places.get(path, origin), allowed=allowed, hint="remove the character")
     if isinstance(node, int) and node.bit_length() > 1023:
-        raise ConfigError("the number is too large", where=places.get(path, origin), allowed="numbers below 1e308")
+        what, allowed, hint = "the number has too many digits", "numbers below 1e308", "write a smaller number"
+        raise ConfigError(what, where=places.get(path, origin), allowed=allowed, hint=hint)
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)
@@ -221,8 +223,9 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
             raise schema.unknown_key_error(name, known, origin)
         below = known[name].type_hint
     elif values is None:
-        allowed = f"a key that ends in '{name}'"
-        raise ConfigError(f"there are no keys below '{name}'", where=origin, allowed=allowed, hint="shorten the key")
+        key = origin.removeprefix("--set ").removesuffix("." + ".".join(parts))
+        what, allowed = f"'{key}' has a value, and no key '{name}' below it", options.describe_type(hint)
+        raise ConfigError(what, where=origin, allowed=allowed, hint=f"write --set {key}=VALUE")
     elif inner is not None and inner.selector_key == "name":
         below = inner.variants_for_named_entry(name, origin).classes[""]
     else:
@@ -251,18 +254,18 @@ class _Reader:
                 return place if place == f"--set {key}" else f"{place}: {key}"
         return f"{self.origin}: {key}" if key else self.origin
 
-    def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
+    def build(self, hint: Any, raw: Any, path: _KeyPath, default: Any = MISSING) -> Any:
         sections, entries = schema.section_variants_from_annotation(hint), options.variadic_tuple_entry_type(hint)
         inner = schema.section_variants_from_annotation(options.mapping_value_type(hint))
         if sections is not None:
             return None if raw is None and sections.is_nullable else self._section(sections, raw, path)
         if entries is not None and schema.section_variants_from_annotation(entries) is not None:
             if not isinstance(raw, list):
-                raise self._wrong(raw, hint, path)
+                raise self._wrong(raw, hint, path, default)
             return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
         if inner is not None:
             if raw is not None and not isinstance(raw, dict):
-                raise self._wrong(raw, hint, path)
+                raise self._wrong(raw, hint, path, default)
             return {
                 name: self._section(inner.variants_for_named_entry(name, self.where((*path, name))), own, (*path, name))
                 for name, own in (raw or {}).items()
@@ -272,14 +275,15 @@ class _Reader:
             json.loads(text, parse_constant=_refuse_nan)
             value = _adapter(hint).validate_json(text, strict=True)
         except (ValidationError, TypeError, ValueError) as error:
-            raise self._wrong(raw, hint, path) from error
+            raise self._wrong(raw, hint, path, default) from error
         return _absolute(value, hint, self.base)
 
     def _section(self, sections: schema.SectionVariants, raw: Any, path: _KeyPath) -> Any:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.options_of_variant(sections.default_variant))
-            what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
+            what = f"{self._name(path)} is {_shown(raw)}, but must be a section of keys"
+            hint = _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.read_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
@@ -294,21 +298,22 @@ class _Reader:
         values: dict[str, Any] = {}
         for name, option in options.class_options_by_key(kind).items():
             if name in raw:
-                values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
+                default = option.default_value
+                values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name), default)
             elif option.default_value is MISSING:
-                allowed, hint = options.describe_type(option.type_hint), f"add {'.'.join(map(str, (*path, name)))}"
+                allowed, hint = options.describe_type(option.type_hint), f"add {self._name((*path, name))}: VALUE"
                 raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=allowed, hint=hint)
         return kind(**values)
 
-    def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
+    def _wrong(self, raw: Any, hint: Any, path: _KeyPath, default: Any) -> ConfigError:
         markers = options.split_annotated(hint)[1]
         unit = next((entry.unit for entry in markers if isinstance(entry, options.OptionInfo) and entry.unit), "")
-        advice = ""
+        advice = options.default_value_hint(self._name(path), default)
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
             advice = f"write the number alone, in {unit}" if unit else "write the number alone"
             if unit and match[2].strip() != unit:
-                advice += f": convert it from {match[2].strip()}"
-        what = f"{self._name(path)} = {_shown(raw)} is not allowed"
+                advice += f", converted from {match[2].strip()}"
+        what = f"{self._name(path)} is {_shown(raw)}, which is not allowed"
         return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
 
     @staticmethod

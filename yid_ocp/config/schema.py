@@ -80,7 +80,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     hints = [near] if near else []
     hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
     # a key of an older version often resembles a present one that means something else
-    hints = [*(hints or ["leave it out"]), RENAMED_NAMES_HINT]
+    hints = [*(hints or [f"leave '{name}' out"]), RENAMED_NAMES_HINT]
     if ":" in name:
         hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

@@ -149,7 +149,7 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
             columns.setdefault(names[i], range(i, i + 3))
     table = _numbers(body, len(axes), where)
     unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
-    notes = ["Motive's y axis is up unless the export states otherwise: export with z up, as positions are not rotated"]
+    notes = ["Motive's y axis is up by default, and positions are not rotated. Check that the export has z up"]
     if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
         notes.append("rigid bodies and markers without a position were left out")
     return _made(table[:, 1], columns, table, unit, "OptiTrack", notes, where)
@@ -237,7 +237,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _broken(where: str, lacking: str) -> DataError:
-    allowed, hint = "an unedited export with its header", "export the motion again, and do not edit the file"
+    allowed, hint = "an export with its whole header, not edited", "export the motion again, and do not edit the file"
     return DataError(f"the motion capture export lacks {lacking}", where=where, allowed=allowed, hint=hint)
 
 
@@ -287,12 +287,18 @@ def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], whe
             if not hasattr(value, part):
                 known = [name for name in getattr(value, "__dataclass_fields__", {}) if not name.startswith("_")]
                 what = f"the message has no field '{path}'"
-                raise DataError(what, where=where, **unknown_name_error_arguments(part, known))
+                said = unknown_name_error_arguments(
+                    part, known, f"choose another field: --field {channel}=/TOPIC.FIELD"
+                )
+                raise DataError(what, where=where, **said)
             value = getattr(value, part)
         try:
             found[channel] = np.asarray(value, float).ravel()
         except (TypeError, ValueError) as error:
-            allowed, hint = "an array of numbers, one for each joint", "choose another field with --field"
+            allowed, hint = (
+                "an array of numbers, one per joint",
+                f"choose another field: --field {channel}=/TOPIC.FIELD",
+            )
             raise DataError(f"the field '{path}' is not numeric", where=where, allowed=allowed, hint=hint) from error
     return _values([str(i + 1) for i in range(max((len(values) for values in found.values()), default=0))], found)
 

@@ -48,25 +48,25 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     shifted, notes = list[Recording](), list[str]()
     for recording in recordings:
         if recording.name in offsets:
-            shift, said = offsets[recording.name], "as specified"
+            shift, said = offsets[recording.name], "as --clock-offset states"
         else:
             shift, said = (0.0, "") if recording is lead else _shift(first, recording)
             if shift:
                 points = tuple(replace(group, clock_offset_std=_ALIGNED_CLOCK_STD) for group in recording.points)
                 recording = replace(recording, points=points)
         if said:
-            notes.append(f"times of {recording.name} were shifted by {shift:+.4f} s: {said}" if shift else said)
+            notes.append(f"the times of {recording.name} were shifted by {shift:+.4f} s, {said}" if shift else said)
         shifted.append(_with_times_shifted(recording, shift))
     begin = min(float(group.t[0]) for recording in shifted for group in recording.all_groups)
     if abs(begin) > _LARGEST_START:
         shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
-        notes.append(f"times count from the first sample, which was recorded at {begin:.9g} s")
+        notes.append(f"times now count from the first sample, which has the time {begin:.9g} s in its file")
     groups, joints = [(r.name, r.joints) for r in shifted if r.joints is not None], None
     if groups:
         hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
         joints, more = joints_on_fastest_clock(groups, where, hint)
         rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
-        notes += [*([f"joints: {rates}"] if len(groups) > 1 else []), *more]
+        notes += [*([f"joints were recorded in {rates}"] if len(groups) > 1 else []), *more]
     merged = Recording(
         joints,
         _with_unique_names(shifted, [r.points for r in shifted]),
@@ -105,19 +105,19 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         if best is None or best.explained < _MIN_EXPLAINED or abs(best.lag) < _MIN_SAID_LAG:
             return 0.0, said
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
-            said += (
-                f"; {LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): the "
-            )
-            said += "sensor is late, the clocks differ, or the object swings behind the arm "
-            said += f"(--clock-offset {other.name}={-best.lag:.2g})"
+            share = f"which explains {best.explained:.0%} of their motion"
+            said += f"; {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): the sensor is late, the clocks differ, or the "
+            said += f"object swings behind the arm (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
-        hint = f"--clock-offset {other.name}=SECONDS shifts its times ({begin - start:.4f}: both begin together)"
+        hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
-    why = "the recording times do not overlap; with this offset the points follow the joint angles best "
-    why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"
+    why = "because the recording times do not overlap; with this shift the points follow the joint angles best "
+    why += (
+        f"({best.explained:.1%} of the motion). A fit corrects what remains, a shift of about {_ALIGNED_CLOCK_STD:g} s"
+    )
     return begin - start - best.lag, why
 
 
@@ -127,7 +127,7 @@ def _check_time_unit(recording: Recording, duration: float, default: str) -> Non
     total = max(len(group.t) for group in recording.all_groups)
     inside = max(np.count_nonzero(group.t - group.t[0] <= duration) for group in recording.all_groups)
     if unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
-        what = f"only {inside} of {total} samples of {name} lie in {duration:.4g} s: its times look like {unit}"
+        what = f"only {inside} of {total} samples of {name} lie in {duration:.4g} s, so its times seem to be in {unit}"
         hint = f"import {name} alone with --units t={unit}, and list its .h5 in its place"
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 

@@ -316,7 +316,7 @@ class Recording(ReprMixin):
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        where, hint = f"recording '{self.name}'", "choose start and stop within the recording"
+        where, hint = f"recording '{self.name}'", f"pass for example start={first:g}, stop={last:g}"
         raise_data_error_unless(start < stop and kept, what, where, f"start < stop, {allowed}", hint)
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
@@ -340,22 +340,24 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
         or effort is beyond any machine. `marker_reference_pose` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    allowed, hint = "a group of joints, points or another sensor", "add joints or points"
-    raise_data_error_unless(recording.all_groups, "the recording has no group", origin, allowed, hint)
+    allowed, hint = "joints, points or another sensor", "pass joints=JointGroup(...) or points=(PointGroup(...),)"
+    raise_data_error_unless(recording.all_groups, "the recording has no measurements", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "a finite number")
+        what, place = f"the true value of '{key}' is {value!r}, but must be a finite number", f"{origin}: truth"
+        raise_data_error_unless(good, what, place, "numbers such as 0.5", f"write a number, or remove '{key}'")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     for noun, groups in (("points", recording.points), ("sensor channels", recording.channel_groups)):
         for name, count in Counter(group.name for group in groups).items():
             what = f"two groups of {noun} are called '{name}'"
-            raise_data_error_unless(count == 1, what, origin, "every name once", "rename one group")
+            raise_data_error_unless(count == 1, what, origin, "every name once", f"rename one of them to {name}_2")
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
-        what, hint = f"a group of points is called '{group.name}'", f"rename it, for example to points_{group.name}"
+        what = f"a group of points is called '{group.name}', but its name must begin with points"
+        hint = f"rename it, for example to points_{group.name}"
         raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
@@ -370,10 +372,9 @@ def _sampled(t: Array) -> str:
     return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 
 
-def raise_data_error_unless(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def raise_data_error_unless(condition: object, what: str, where: str, allowed: str, hint: str) -> None:
     """Raise a `DataError` with the texts `what`, `where`, `allowed` and `hint` unless a condition holds."""
     if not condition:
-        hint = hint or "correct the entry that `where` names, or repeat `yid-ocp import` with the original data"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -382,7 +383,7 @@ def read_only_copy(value: ArrayLike, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        what, hint = "the value is not an array of real numbers", "write numbers, in rows of equal length"
+        what, hint = "the value is not an array of real numbers", "write numbers only, in rows of equal length"
         raise DataError(what, where=where, allowed="an array of real numbers", hint=hint) from error
     array.setflags(write=False)
     return array
@@ -425,14 +426,16 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         raise_data_error_unless(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
-    raise_data_error_unless(ok, "a value is neither 0 nor 1", f"{where}/torque_enable", "0 (motor off) or 1 (motor on)")
+    what, allowed = "torque_enable has a value that is neither 0 nor 1", "0 (motor off) or 1 (motor on)"
+    raise_data_error_unless(ok, what, f"{where}/torque_enable", allowed, "write 0 and 1, or leave torque_enable out")
     for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
-        what, hint = f"the kind of the efforts is '{joints.effort_kind}'", "leave the attribute out if it is not known"
+        what = f"effort_kind is '{joints.effort_kind}', which is unknown"
+        hint = "write effort_kind = sample, or leave the attribute out if it is not known"
         raise_data_error_unless(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
 
@@ -454,7 +457,8 @@ def _validate_points(group: PointGroup, where: str) -> None:
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {next(iter(wrong), 0.0):g} m"
-        raise_data_error_unless(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m")
+        hint = "write the sensor's noise, such as 0.002, wherever the point was seen"
+        raise_data_error_unless(wrong.size == 0, what, f"{where}/std", f"0 to {_LARGEST_SPREAD:g} m", hint)
     if group.camera_pose is not None:
         _check_pose(group.camera_pose, f"{where}, attribute pose")
     if group.clock_offset_std is not None:
@@ -464,7 +468,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
 def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
     largest = float(np.abs(positions).max(initial=0.0))
     hint = "if the unit is millimetres, convert the values to metres"
-    what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
+    what, allowed = f"a coordinate reaches {largest:g} m, beyond {_LARGEST_DISTANCE:g} m", "coordinates in metres"
     raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 
 
@@ -473,19 +477,19 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     declared = {channel.quantity: channel for channel in channel_specs_for_group_name(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.noise_and_bias_stds_by_attribute
-    allowed, hint = ", ".join(declared), "add one of the allowed datasets, or leave the group out"
-    allowed = allowed or "a group of a kind of sensor that the package knows"
+    hint = "add one of the allowed datasets, or leave the group out"
+    allowed = ", ".join(declared) or ", ".join(CHANNEL_KINDS)
     raise_data_error_unless(own, "the group has no dataset of measured values", where, allowed, hint)
     for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
-            what = f"the group has an unknown {noun}, '{name}'"
-            raise_data_error_unless(name in known, what, where, **unknown_name_error_arguments(name, known))
+            what, hint = f"the group has an unknown {noun}, '{name}'", f"rename or remove the {noun} '{name}'"
+            raise_data_error_unless(name in known, what, where, **unknown_name_error_arguments(name, known, hint))
     for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
-        is_finite = bool(np.isfinite(values).all())
-        raise_data_error_unless(is_finite, "a measured value is not finite", f"{where}/{quantity}", "finite numbers")
+        what, hint = f"{quantity} has a value that is not finite", "remove the samples in which a value is missing"
+        raise_data_error_unless(np.isfinite(values).all(), what, f"{where}/{quantity}", "finite numbers", hint)
     for name, std in stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -494,46 +498,58 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
-    raise_data_error_unless(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", "leave it out if unknown")
+    what, hint = f"{name} is {std}, which is out of range", f"write a value in this range, or leave {name} out"
+    raise_data_error_unless(good, what, where, f"0 to {_LARGEST_SPREAD:g}", hint)
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
     allowed, hint = "`straight` together with a group of points", "add the group of points, or leave `straight` out"
     raise_data_error_unless(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
-    finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
-    raise_data_error_unless(finite, "a position is not finite", where, allowed)
+    what, allowed = "`straight` has a position that is not finite", "finite coordinates of every point [m]"
+    hint = "measure all points while the object is straight, or leave `straight` out"
+    raise_data_error_unless(np.isfinite(straight).all(), what, where, allowed, hint)
     _check_distances(straight, where)
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    raise_data_error_unless(first is groups[0], what, where, "point groups sorted by name", "sort the groups by name")
+    hint = f"pass '{first.name}' as the first of the point groups, with its own `straight`"
+    raise_data_error_unless(first is groups[0], what, where, "point groups sorted by name", hint)
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "a rigid transform")
-    rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    raise_data_error_unless(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
+    rotation, allowed = pose[:3, :3], "a rotation (3, 3), a translation (3, 1) [m] and the last row 0 0 0 1"
     last_is_unit = np.allclose(pose[3], np.eye(4)[3], rtol=0, atol=1e-6)
     orthonormal = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6)
-    raise_data_error_unless(last_is_unit, f"the last row of the pose is {pose[3].tolist()}", where, allowed)
-    raise_data_error_unless(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
-    raise_data_error_unless(np.linalg.det(rotation) > 0, "the pose contains a reflection", where, allowed)
+    reflects = orthonormal and np.linalg.det(rotation) < 0
+    for good, what, hint in (
+        (np.isfinite(pose).all(), "has a value that is not finite", "write finite numbers, or leave the pose out"),
+        (last_is_unit, f"has the last row {pose[3].tolist()}", "transpose the pose, or write 0 0 0 1 as its last row"),
+        (
+            orthonormal,
+            "has axes that are not orthonormal",
+            "write the rotation with 7 digits or more and without a scale",
+        ),
+        (not reflects, "contains a reflection", "reverse the signs of one column of the rotation"),
+    ):
+        raise_data_error_unless(good, f"the pose {what}", where, allowed, hint)
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one name for every column, each once"
-    raise_data_error_unless(group.names, "the group has no names", where, allowed, "write the attribute `names`")
+    raise_data_error_unless(group.names, "the group has no names", where, allowed, "write them into its entry `names`")
     allowed, hint = "one sample or more", "leave the group out, or import data with samples"
     raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
         what, allowed = f"the name {name!r} cannot be used", "a text that is not empty and has no control characters"
-        raise_data_error_unless(usable, what, place, allowed, "rename it")
-        what = f"the name '{name}' occurs {count} times"
-        raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
+        raise_data_error_unless(usable, what, place, allowed, "use letters, digits and underscores, as in left_s0")
+        what, hint = f"the name '{name}' occurs {count} times", f"rename all but one, for example to '{name}_2'"
+        raise_data_error_unless(count == 1, what, place, "every name once", hint)
+    what, hint = f"the clock is '{group.clock}', which is unknown", "leave clock out if the times were measured"
     clocks, place = get_args(TimestampKind), f"{where}, attribute clock"
-    raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
+    raise_data_error_unless(group.clock in clocks, what, place, " or ".join(clocks), hint)
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
@@ -548,8 +564,13 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    what, allowed = f"the array has shape {array.shape}", f"{shape}, that is {letters}"
-    raise_data_error_unless(array.shape == shape, what, where, allowed, "write an array of this shape")
+    what, allowed = (
+        f"the array has shape {array.shape}, but must have {shape}",
+        f"{letters}, as in docs/reference/recordings.md",
+    )
+    is_turned = array.shape[::-1] == shape
+    hint = "transpose the array" if is_turned else "check that this array belongs to the `t` and `names` of its group"
+    raise_data_error_unless(array.shape == shape, what, where, allowed, hint)
 
 
 def _check_text(where: str, *texts: tuple[str, str]) -> None:
@@ -557,4 +578,6 @@ def _check_text(where: str, *texts: tuple[str, str]) -> None:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
         what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters and surrogates"
-        raise_data_error_unless(storable, what, f"{where}, attribute {name}", allowed, "remove these characters")
+        raise_data_error_unless(
+            storable, what, f"{where}, attribute {name}", allowed, r"remove \0 and \ud800 to \udfff"
+        )

@@ -58,7 +58,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     path = Path(path)
     digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
-    hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.read_any"
+    hint = f"convert another format by `yid-ocp import {path} --out RECORDING.h5`, or read it by yid_ocp.read_any"
     raise_data_error_unless(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
     with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)
@@ -121,13 +121,17 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         where, declared = f"{origin}: {name}", channel_specs_for_group_name(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_question(name, ("joints", "points", *further, _STRAIGHT))
-        what, hint = f"{_RECORDING_FORMAT} files have no group '{name}'", hint or "rename or delete the group"
+        what, hint = f"the file has an unknown group, '{name}'", hint or f"rename or delete the group '{name}'"
         raise_data_error_unless(legal, what, origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
         group = file[name]
-        raise_data_error_unless(isinstance(group, h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
+        what, hint = (
+            f"'{name}' is a dataset, but must be a group",
+            f"store the values as a dataset in the group '{name}'",
+        )
+        raise_data_error_unless(isinstance(group, h5py.Group), what, where, "a group with t, position, ...", hint)
         if name == "joints":
             joints = JointGroup(**gain | _read_group(group, where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
         elif declared:
@@ -142,12 +146,12 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             own = _read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, ("names", "sensor", "frame"))
             points.append(PointGroup(name, sensor_name=own.pop("sensor"), camera_pose=own.pop("pose", None), **own))
     where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
-    truth = _json(texts["truth"] or "{}", where, allowed)
-    raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object of numbers", where, allowed)
+    truth, hint = _json(texts["truth"] or "{}", where, allowed), "correct the attribute, or delete it"
+    raise_data_error_unless(isinstance(truth, dict), "the JSON text is not an object of numbers", where, allowed, hint)
     where, allowed = f"{origin}, attribute notes", '["sentence", ...]'
     notes = _json(texts["notes"] or "[]", where, allowed)
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
-    raise_data_error_unless(good, "the JSON text is not a list of sentences", where, allowed)
+    raise_data_error_unless(good, "the JSON text is not a list of sentences", where, allowed, hint)
     said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
     return Recording(joints, tuple(points), *said, tuple(channels))
 
@@ -165,13 +169,13 @@ def _read_group(
         ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
-            what, hint = f"the group has an unknown {noun}, '{name}'", f"rename or delete the {noun}"
+            what, hint = f"the group has an unknown {noun}, '{name}'", f"rename or delete the {noun} '{name}'"
             raise DataError(what, where=where, **unknown_name_error_arguments(name, known, hint))
         for name in sorted(wanted - found):
-            what, hint = f"the {noun} '{name}' is missing", f"add the {noun}, or leave the group out"
+            what, hint = f"the {noun} '{name}' is missing", f"add the {noun} '{name}', or leave the group out"
             raise DataError(what, where=where, allowed=f"groups with {', '.join(sorted(wanted))}", hint=hint)
     what, is_twice = "`std` is both a dataset and an attribute", "std" in group and "std" in group.attrs
-    raise_data_error_unless(not is_twice, what, where, "a dataset or an attribute", "delete one of them")
+    raise_data_error_unless(not is_twice, what, where, "a dataset or an attribute", "delete one of the two `std`")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -186,10 +190,11 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     good = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    raise_data_error_unless(good, "the entry is not a dataset of real numbers", where, "a dataset of real numbers")
+    what, allowed = "the entry is not a dataset of real numbers", "a dataset of the type float or integer"
+    raise_data_error_unless(good, what, where, allowed, "write it again as float64, not as text, complex or a group")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
-    hint = f"convert the values to {unit}, and write this unit: values of a recording are never converted on reading"
-    raise_data_error_unless(found == unit, f"the unit of the dataset is '{found}'", where, unit, hint)
+    hint = f"convert the values to {unit}, and write this unit (a recording is never converted when it is read)"
+    raise_data_error_unless(found == unit, f"the unit is '{found}', but must be '{unit}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -204,7 +209,8 @@ def _text(value: object, where: str) -> str:
         except UnicodeDecodeError as error:
             hint = "write the attribute again as UTF-8"
             raise DataError("the attribute is not UTF-8 text", where=where, allowed="UTF-8 text", hint=hint) from error
-    raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text")
+    hint = "write the attribute again as text, such as 'world'"
+    raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text", hint)
     return str(value)
 
 
@@ -212,7 +218,8 @@ def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError("the text is not JSON", where=where, allowed=allowed, hint="correct or delete it") from error
+        what, hint = f"the text is not JSON ({error})", "correct the attribute, or delete it"
+        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]
@@ -252,11 +259,11 @@ def check_readable_in_child_process(path: Path, complaint: Callable[[Path], str]
             os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
     if answer is None:
-        what = f"the {noun} file cannot be read within {_READ_TIMEOUT:g} s: it is damaged, or far too large"
+        what = f"the {noun} file cannot be read within {_READ_TIMEOUT:g} s, so it is damaged or far too large"
     elif not answer:
         number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         how = signal.Signals(number).name if number else "an exit"
-        what = f"the {noun} file is damaged (reading it ends the {noun} library with {how})"
+        what = f"the {noun} file is damaged: the {noun} library crashes when it reads the file ({how})"
     else:
         what = answer[1:]
     if what:

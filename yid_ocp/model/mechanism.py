@@ -170,7 +170,8 @@ class Mechanism(ReprMixin):
         line, _, said = name.partition(":")
         if not self.has_frame(name):
             known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
-            choice = unknown_name_error_arguments(name, known)
+            otherwise = f"use the name of a frame, or add the frame: model.frames: {{{name}: {{parent_frame: FRAME}}}}"
+            choice = unknown_name_error_arguments(name, known, otherwise)
             raise ModelError(f"there is no frame '{name}'", where=f"model '{self.name}'", **choice)
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
@@ -220,7 +221,8 @@ class Mechanism(ReprMixin):
         """Return a copy with a new frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
             what, where = f"there is already a frame '{name}'", f"model '{self.name}'"
-            raise ModelError(what, where=where, allowed="a new name", hint="choose another name for the frame")
+            allowed, hint = "a name that no frame has", f"call the added frame '{name}_2', for example"
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
         added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})

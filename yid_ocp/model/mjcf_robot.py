@@ -85,8 +85,8 @@ def _compiled(file: Path, changed: int) -> Any:
     try:
         model = mujoco.MjModel.from_xml_path(str(check_input_file(file)))
     except Exception as error:  # MuJoCo raises ValueError, and others for files that are missing
-        what = f"MuJoCo cannot read the file: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        hint = "open it in MuJoCo's viewer to find the error; meshes must be where the file refers to them"
+        what = f"MuJoCo cannot read the file ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+        hint = "correct the file until `python -m mujoco.viewer --mjcf=FILE` opens it; copy its meshes beside it"
         raise ModelError(what, where=str(file), allowed="MJCF that MuJoCo compiles", hint=hint) from error
     for sentence in _left_out(model):
         log.warning("%s: %s", file.name, sentence)
@@ -112,8 +112,14 @@ def _body(
     for j in range(first, first + count):
         label, kind = _joint_name(model, j), _JOINT_TYPE_NAMES.get(int(model.jnt_type[j]))
         if kind is None:
-            what, allowed = f"joint '{label}' has the type {'ball' if model.jnt_type[j] else 'free'}", "hinge, slide"
-            raise ModelError(what, where=where, allowed=allowed, hint="delete a free joint; replace a ball by hinges")
+            kind, hint = "free", f"delete the free joint '{label}', so that its body is fixed"
+            if model.jnt_type[j]:
+                kind, hint = "ball", "replace the ball by three hinges with the axes x, y and z"
+            what, allowed = (
+                f"joint '{label}' has the type {kind}, which is not modelled",
+                "joints of type hinge or slide",
+            )
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         origin = at @ _shift(place - last) @ joint_displacement_transform(axis, -ref, kind)
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"
@@ -187,16 +193,16 @@ def _left_out(model: Any) -> Iterator[str]:
     others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
     motors = sum(_is_motor(model, i) for i in others_than_servos)
     others = {
-        "motors": (motors, "except their limits; efforts are torques at the joint"),
+        "motors": (motors, "Their limits are kept, and efforts are torques at the joint"),
         "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
-        "equalities": (model.neq - taken, "for welds and connects that close loops, set model.grasp"),
-        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "set model.joint_springs"),
+        "equalities": (model.neq - taken, "For a weld or connect that closes a loop, set model.grasp"),
+        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "To have them, set model.joint_springs"),
         "tendons": (model.ntendon, ""),
         "bodies of free objects": (len(_bodies_of_free_objects(model)), ""),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
     }
     for noun, (count, remedy) in ((noun, own) for noun, own in others.items() if own[0]):
-        yield f"{noun}: {count} ignored" + (f" ({remedy})" if remedy else "")
+        yield f"the model leaves out {noun} ({count} in the file)" + (f". {remedy}" if remedy else "")
 
 
 def _body_name(model: Any, i: int) -> str:

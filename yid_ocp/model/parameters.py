@@ -32,7 +32,8 @@ class Parameter:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
             what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
-            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint="give it a finite value")
+            hint = f"pass a finite value, or set parameters.{self.name}.initial: 1.0, for example"
+            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint=hint)
         if not self.lower <= self.value <= self.upper:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
@@ -49,8 +50,8 @@ class Parameters(ReprMixin):
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
             twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
-            what, hint = f"two parameters are called {twice[0]}", "give each joint, segment and effect its own name"
-            raise ConfigError(what, where="parameters of the model", allowed="unique names", hint=hint)
+            what, hint = f"two parameters are called '{twice[0]}'", "give each joint, segment and effect its own name"
+            raise ConfigError(what, where="parameters of the model", allowed="every name once", hint=hint)
 
     def _summary(self) -> ReprTexts:
         rows = [("parameter", "value", "unit", "lower", "upper")]
@@ -90,7 +91,8 @@ class Parameters(ReprMixin):
         for name, value in (values or {}).items():
             if not math.isfinite(value):
                 what, allowed = f"{name} = {value} is not a finite number", "a finite number"
-                raise ConfigError(what, where=f"parameter {name}", allowed=allowed, hint="give it a finite value")
+                hint = f"pass a finite value, such as the nominal {name}={self[name].value:g}"
+                raise ConfigError(what, where=f"parameter {name}", allowed=allowed, hint=hint)
             theta[self.index(name)] = value
         return theta
 

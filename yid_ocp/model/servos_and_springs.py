@@ -97,7 +97,8 @@ class MotorKindAndPreset:
         if self.preset is not None and self.kind != "dc":
             what = f"the preset '{self.preset}' is for a dc motor, but the motor has kind: {self.kind}"
             hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
-            raise ConfigError(what, where="model.arms.servo.motor.preset", allowed="preset with kind: dc", hint=hint)
+            allowed = "a preset with kind: dc, or no preset"
+            raise ConfigError(what, where="model.arms.servo.motor.preset", allowed=allowed, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class ServoModelOptions:
             what = "derivative is not possible with an ideal motor, whose derivative gain is JOINT.servo_damping"
             hint = "leave derivative out, or set model.arms.servo.motor.kind: dc"
             where = "model.arms.servo.extra_controller_terms"
-            raise ConfigError(what, where=where, allowed="derivative with kind: dc", hint=hint)
+            raise ConfigError(what, where=where, allowed="derivative only with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)

@@ -284,7 +284,11 @@ class System(ReprMixin):
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
-            raise ModelError(f"gravity = {gravity} is invalid", where="gravity", allowed="3 finite numbers [m/s^2]")
+            what, hint = (
+                f"gravity is {gravity.tolist()}, but must be 3 finite numbers",
+                "pass gravity=(0.0, 0.0, -9.81)",
+            )
+            raise ModelError(what, where="gravity", allowed="x, y, z in the world frame [m/s^2]", hint=hint)
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
@@ -465,10 +469,11 @@ def _check_names(
     for kind, names in named.items():
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             what, allowed = f"'{repeated[0]}' is listed twice among the {kind}", "each name once"
-            raise ModelError(what, where=kind, allowed=allowed, hint="delete one of the two")
+            raise ModelError(what, where=kind, allowed=allowed, hint=f"delete one '{repeated[0]}' from the list")
     if both := sorted(set(driven) & set(prescribed)):
         what, where = f"joint '{both[0]}' is both driven and prescribed", "driven and prescribed joints"
-        raise ModelError(what, where=where, allowed="one of the two", hint="leave the joint out of one of the lists")
+        hint = f"leave '{both[0]}' out of one of the two lists"
+        raise ModelError(what, where=where, allowed="each joint in one of the two lists", hint=hint)
     for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
         tree.frame(frame)
 

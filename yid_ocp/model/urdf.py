@@ -69,9 +69,9 @@ def _example_robot_urdf(robot: str) -> Path:
     if found:
         what = f"example-robot-data has {len(found)} robots '{robot}'"
         allowed = ", ".join(f"package:{n}" for n in found)
-        raise ModelError(what, where=where, allowed=allowed, hint="name one of them by its folder")
+        raise ModelError(what, where=where, allowed=allowed, hint=f"choose one of them, such as package:{found[0]}")
     what, stems = f"example-robot-data has no robot '{robot}'", sorted({path.stem for path in files.values()})
-    said = unknown_name_error_arguments(robot, stems, "write package:NAME, such as package:xarm7")
+    said = unknown_name_error_arguments(robot, stems, f"choose one of the robots, such as package:{stems[0]}")
     raise ModelError(what, where=where, **said)
 
 
@@ -135,7 +135,7 @@ def read_urdf(
     """
     file, locked = urdf_path_from_robot_name(path), dict(locked or {})
     if not is_file(file):
-        hint = "give a path, or package:NAME for example-robot-data"
+        hint = "correct the path, or use a known robot, such as package:ur5"
         with contextlib.suppress(ModelError):
             _example_robot_urdf(str(path))
             hint = f"did you mean package:{path}?"
@@ -146,8 +146,8 @@ def read_urdf(
     dropped = _with_all_below(exclude_links, robot, where)
     for joint in robot.joints:
         if joint.child in dropped and joint.name in named:
-            what = f"joint '{joint.name}' carries the excluded link '{joint.child}'"
-            hint = f"keep the link, or leave '{joint.name}' out of the joints"
+            what = f"joint '{joint.name}' is to be used, but carries the excluded link '{joint.child}'"
+            hint = f"leave the link out of exclude_links, or '{joint.name}' out of joints and locked joints"
             raise ModelError(what, where=where, allowed="joints whose links are not excluded", hint=hint)
     following = _mimicked(robot, joints, locked, where)
     if joints is None:
@@ -209,7 +209,7 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise
     except Exception as error:  # a malformed file raises many kinds
         reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
-        allowed, hint = "a URDF file with links and joints", "check it with check_urdf, or export it again"
+        allowed, hint = "a URDF file with links and joints", f"run `check_urdf {file}`, or export the file again"
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
@@ -273,15 +273,17 @@ def _part(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
     if any("xacro}" in part.tag for part in robot.iter()):
-        hint = "expand them: xacro FILE.xacro > robot.urdf"
-        raise ModelError("the file has xacro elements", where=where, allowed="URDF without macros", hint=hint)
+        hint = f"expand the macros by `xacro {where} > robot.urdf`, and use robot.urdf"
+        raise ModelError(
+            "the file has xacro macros that are not expanded", where=where, allowed="URDF without macros", hint=hint
+        )
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue
         name = f"{owner.tag} '{owner.get('name')}'"
         inertials = owner.findall("inertial")
         if len(inertials) > 1:
-            what, hint = f"{name} has {len(inertials)} elements <inertial>", "delete all but one"
+            what, hint = f"{name} has {len(inertials)} elements <inertial>", "delete all but one of them in the URDF"
             raise ModelError(what, where=where, allowed="at most one <inertial>", hint=hint)
         for part in (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin")):
             for key in {"xyz", "rpy"} & set(part.attrib):
@@ -309,9 +311,9 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
         numbers = []
     wrong = any(math.isnan(value) or (abs(value) > _MAX_NUMBER and not infinite) for value in numbers)
     if len(numbers) != count or wrong:
-        allowed = "one number" if count == 1 else f"{count} numbers with blanks between"
-        allowed, hint = f"{allowed}, of at most {_MAX_NUMBER:g}", "correct the attribute in the URDF"
-        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=allowed, hint=hint)
+        noun = "one number" if count == 1 else f"{count} numbers with blanks between"
+        allowed, hint = f"{noun}, of at most {_MAX_NUMBER:g}", f"write '{' '.join(['0.1'] * count)}', for example"
+        raise ModelError(f"{what} is '{text[:60]}', but must be {noun}", where=where, allowed=allowed, hint=hint)
     return numbers
 
 
@@ -321,11 +323,11 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -max(_PRINCIPAL_MOMENT_RTOL * max(most, -least), _PRINCIPAL_MOMENT_ATOL):
         what = f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)"
-        hint = "correct the <inertia> of the link"
+        hint = "correct the <inertia> of the link: a wrong sign, or ixy in place of ixx, are usual causes"
         raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
-        what = "%s: link '%s' has principal moments of inertia of %s kg m^2; in any body, the largest is at most "
-        log.warning(what + "the sum of the other two", where, link, values)
+        what = "%s: link '%s' has principal moments of inertia of %s kg m^2, but in any body the largest is at most "
+        log.warning(what + "the sum of the others. They are used unchanged: check <inertia>", where, link, values)
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
@@ -339,12 +341,13 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
             raise ModelError(what, where=where, allowed="joints without <mimic>", hint=hint)
         if mimic.joint not in joints:
             what = f"joint '{name}' follows (mimic) a joint '{mimic.joint}' that does not exist"
-            raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints))
+            otherwise = f"name an existing joint in the <mimic> of '{name}', or delete it"
+            raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints, otherwise))
         if name in locked:
             continue
         if wanted is None or mimic.joint in wanted:
-            what = "%s: joint '%s' follows '%s'; couplings are not modelled, so it is locked"
-            log.warning(what, where, name, mimic.joint)
+            what = "%s: joint '%s' follows '%s' (mimic). Couplings are not modelled, so '%s' does not move in the model"
+            log.warning(what, where, name, mimic.joint, name)
         locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
     return set(following)
 
@@ -353,19 +356,22 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
     """Name of the root link, after a check of all joints and links and of the names of wanted joints."""
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
-            what, hint = f"joint '{joint.name}' has the type '{joint.type}'", "replace it by joints of these types"
+            what = f"joint '{joint.name}' has the type '{joint.type}', which is not modelled"
+            hint = "set its type to fixed, or replace it by several joints of the allowed types"
             raise ModelError(what, where=where, allowed="revolute, continuous, prismatic, fixed", hint=hint)
         if joint.type in _MOVABLE_JOINT_TYPES and np.linalg.norm(joint.axis) < 1e-9:
-            allowed, hint = "an axis other than 0 0 0", "write the axis, or set the type of the joint to fixed"
-            raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
+            what, allowed = f"the axis of joint '{joint.name}' is 0 0 0", "an axis other than 0 0 0"
+            hint = 'write the axis, such as <axis xyz="0 0 1"/>, or set the type of the joint to fixed'
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
     require_known_names(wanted, known, "movable joint", where, ModelError)
     names, below = [link.name for link in robot.links], [joint.child for joint in robot.joints]
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
             if link not in names:
-                what = f"joint '{joint.name}' has a link '{link}' that does not exist"
-                raise ModelError(what, where=where, **unknown_name_error_arguments(str(link), names))
+                what = f"joint '{joint.name}' connects a link '{link}' that does not exist"
+                said = unknown_name_error_arguments(str(link), names, f'add <link name="{link}"/> to the URDF')
+                raise ModelError(what, where=where, **said)
     roots = [name for name in dict.fromkeys(names) if name not in below]
     if len(roots) != 1:
         what = f"the URDF has {len(roots)} root links" + (f": {', '.join(map(str, roots[:4]))}" if roots else "")
@@ -374,7 +380,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
     kinds = {"links are called": names, "joints are called": [joint.name for joint in robot.joints]}
     for kind, entries in (kinds | {"joints carry the link": below}).items():
         if repeated := sorted({entry for entry in entries if entries.count(entry) > 1}):
-            hint = "delete one of the joints" if entries is below else "rename one of them"
+            hint = ("delete" if entries is below else "rename") + " one of the two in the URDF"
             allowed = "a tree in which every name is unique and every link has one parent"
             raise ModelError(f"two {kind} '{repeated[0]}'", where=where, allowed=allowed, hint=hint)
     return str(roots[0])
@@ -411,7 +417,8 @@ def _walk(
                 stack.append((joint.child, carrier, at @ joint.origin @ motion, link))
     if loose := sorted(set(links) - set(frames) - dropped):
         what = f"link '{loose[0]}' is not connected to the root link '{root}'"
-        raise ModelError(what, where=where, allowed="one tree of links", hint="connect it by a joint, or delete it")
+        hint = f"add a joint of type fixed whose child is '{loose[0]}', or delete the link"
+        raise ModelError(what, where=where, allowed="one tree of links", hint=hint)
     return joints, bodies, frames
 
 
@@ -443,8 +450,8 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
     while waiting:
         link = waiting.pop()
         if link not in links:
-            what, said = f"there is no link '{link}' to leave out", unknown_name_error_arguments(link, links)
-            raise ModelError(what, where=where, **said)
+            what, otherwise = f"there is no link '{link}' to leave out", f"remove '{link}' from exclude_links"
+            raise ModelError(what, where=where, **unknown_name_error_arguments(link, links, otherwise))
         found.add(link)
         waiting += [joint.child for joint in robot.joints if joint.parent == link]
     return found

@@ -103,8 +103,8 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
         return []
     if arm:
         both = f"the encoders and the points '{arm[0]}' on the arm are both used"
-        what = f"{both}, but the points follow from the encoders"
-        allowed, hint = "encoders or points", f"set sensors.{arm[0]}.use: false, or leave the encoders out"
+        what = f"{both}, but the points are computed from the encoders and are no further measurements"
+        allowed, hint = "encoders or points", f"set sensors.{arm[0]}.use: false, or sensors.joints.position.use: false"
         raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name
     later = (joints.t > around.node_times[0] + 1e-9) & (joints.t <= around.node_times[-1] + 1e-9)
@@ -142,7 +142,9 @@ def filtered_effort_sensor_data(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = decorrelated_nodes_and_low_pass_values(inputs, t, values, "efforts", at_centres=not is_sample)
+    kept, measured = decorrelated_nodes_and_low_pass_values(
+        inputs, t, values, sensor.group_name, at_centres=not is_sample
+    )
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -154,13 +156,13 @@ def filtered_effort_sensor_data(
 
 
 def decorrelated_nodes_and_low_pass_values(
-    inputs: SensorDataInputs, t: Array, values: Array, noun: str, *, at_centres: bool = False, like_path: bool = False
+    inputs: SensorDataInputs, t: Array, values: Array, key: str, *, at_centres: bool = False, like_path: bool = False
 ) -> tuple[IntArray, Array]:
     """Low-pass filter values; return nodes (K,) at which their noise is nearly independent, and the values (K, k).
 
     `values` (M, k) belong to the times `t` [s] or, with `at_centres`, to the centres of the intervals from these times.
     `like_path` selects the path filter; the default is the effort filter, which is also applied to predictions. Raises
-    `DataError`, which names `noun`, if there are too few samples for the filter.
+    `DataError`, which names the sensor's settings `key`, if there are too few samples for the filter.
     """
     low_pass, times = inputs.path_filter if like_path else inputs.effort_filter, inputs.node_times
     # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
@@ -173,8 +175,8 @@ def decorrelated_nodes_and_low_pass_values(
     kept = kept[(times[kept] > t[0] + distorted - step) & (times[kept] < t[-1] - distorted + step) & (len(t) > 1)]
     if not len(kept):
         length, allowed = min(steps * step, float(t[-1] - t[0])), f"more than {2 * ends * step:.3g} s"
-        what = f"{length:.3g} s of {noun} are too short for a low-pass filter of {low_pass.cutoff:g} Hz"
-        hint = "use a longer recording, raise problem.path_cutoff, or leave this sensor out (`use: false`)"
+        what = f"{length:.3g} s of {key} are too short for the low-pass filter of {low_pass.cutoff:g} Hz"
+        hint = f"use a longer recording, raise problem.path_cutoff, or set sensors.{key}.use: false"
         raise DataError(what, where=f"recording '{inputs.recording.name}'", allowed=allowed, hint=hint)
     smooth, late = low_pass(t, values), 0.5 * period if at_centres else 0.0
     return kept, np.stack([np.interp(times[kept], t + late, column) for column in smooth.T], axis=1)
@@ -245,8 +247,9 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
     """Noise std (k,) of channels (N, k) by high-order differences. Changes as fast as the sampling count as noise."""
     order = NOISE_ESTIMATE_DIFFERENCE_ORDER
     if len(values) <= order:
-        what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"{order + 1} or more"
-        raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
+        what = f"{len(values)} samples are too few to estimate the noise of {group}"
+        allowed, hint = f"{order + 1} samples or more", f"set sensors.{group}.std: NUMBER, in {unit}"
+        raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=hint)
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
 

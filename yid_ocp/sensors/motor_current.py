@@ -53,14 +53,15 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
         return None
     for name in group.names:
         if name not in around.system.mechanism.joint_names:
-            said = unknown_name_error_arguments(name, around.system.mechanism.joint_names)
-            raise DataError(f"the motor currents name joint '{name}', which the model lacks", where=where, **said)
+            otherwise = f"correct the name in the recording, or set sensors.{key}.use: false"
+            said = unknown_name_error_arguments(name, around.system.mechanism.joint_names, otherwise)
+            raise DataError(f"currents are recorded for '{name}', which is no joint of the model", where=where, **said)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     if constants is None:
         what, allowed = "the motors' torque constants are not stated", "torque at the joint per current [N m/A]"
-        hint = f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}}"
+        hint = f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: NUMBER}}, or {{JOINT: NUMBER, ...}} as its value"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     if std is None:
         raise base.missing_noise_level_error("the motor currents", where, key, "A")
@@ -69,8 +70,9 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
         for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
     ]
     if not np.all(by_joint[0] != 0):
-        where, allowed = f"sensors.{key}.constants", "numbers that are not zero [N m/A]"
-        raise DataError("a torque constant is zero", where=where, allowed=allowed)
+        what = f"the torque constant of joint '{names[int(np.argmin(np.abs(by_joint[0])))]}' is zero"
+        where, hint = f"sensors.{key}.constants", f"set its {_TORQUE_CONSTANT} to the torque per current of the motor"
+        raise DataError(what, where=where, allowed="numbers other than zero [N m/A]", hint=hint)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
     return filtered_effort_sensor_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)

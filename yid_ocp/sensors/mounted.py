@@ -69,7 +69,7 @@ def _measured(
     around: base.SensorDataInputs, kind: type[MountedSensor], group: base.RecordedExtraChannelsInterface, key: str
 ) -> base.SensorData:
     choice, tree = around.sensor_usage(key), around.system.mechanism
-    where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
+    where, channel, names = f"recording '{around.recording.name}': {group.name}", kind.channel, group.names
     frames = tuple(choice.frame_by_recorded_name.get(name, name) for name in names)
     for name, frame in zip(names, frames, strict=True):
         if not tree.has_frame(frame) or tree.frame(frame).joint_index < 0:
@@ -89,8 +89,9 @@ def _measured(
     ]
     signs = base.expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
     if not np.all(np.abs(signs) == 1):
-        what = f"the sign of {key} is {', '.join(f'{sign:g}' for sign in signs)}"
-        raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1")
+        what = f"the sign of {key} is {', '.join(f'{sign:g}' for sign in signs)}, but must be 1 or -1"
+        hint = f"set sensors.{key}.constants: {{sign: -1}} if the sensor's sign is opposite; otherwise leave it out"
+        raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1", hint=hint)
     sensor = kind(names, tuple(signs.tolist()), frames, key)
     values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)
     inner = (1, len(around.node_times) - 2)  # forces at both ends depend on the motion beyond the recording

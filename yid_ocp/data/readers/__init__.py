@@ -41,7 +41,8 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     for name in options:
         if name not in known:
             what = f"the reader of '{known_as}' files has no option '{name}'"
-            raise DataError(what, where=str(path), **unknown_name_error_arguments(name, known))
+            said = unknown_name_error_arguments(name, known, f"leave the option '{name}' out")
+            raise DataError(what, where=str(path), **said)
     given = {"options": replace(default, **options)} if default else options
     return reader(path, **given, **_told(reader, progress))
 
@@ -75,12 +76,13 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        hint = nearest_name_question(path.name, near) or "correct the path: no file of its folder has a similar name"
+        hint = nearest_name_question(path.name, near) or "correct the path: its folder has no file of a similar name"
         raise DataError("there is no such file", where=str(path), allowed="an existing file or folder", hint=hint)
     key = path.suffix.lower()
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        what, known = f"there is no reader for '{key}' files", unknown_name_error_arguments(key, READERS)
-        raise DataError(what, where=str(path), **known)
+        otherwise = "export the data as CSV, with the columns t, q_JOINT, effort_JOINT, POINT_x, ..."
+        known = unknown_name_error_arguments(key, READERS, otherwise)
+        raise DataError(f"there is no reader for '{key}' files", where=str(path), **known)
     return key

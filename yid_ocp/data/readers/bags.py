@@ -90,15 +90,15 @@ class OpenBag:
                 yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"
-            what = "the bag cannot be read: it is incomplete or damaged"
-            hint = f"repair it by `{tool} reindex`, or copy it again"
+            what = "the bag cannot be read, because it is incomplete or damaged"
+            hint = f"repair it by `{tool} reindex {self.path}`, or copy it again"
             if isinstance(error, MemoryError):
-                what = "the bag cannot be read: it is damaged, or needs too much memory"
-                hint = f"check it by `{tool} info`"
+                what = "the bag cannot be read, because it is damaged or needs too much memory"
+                hint = f"check it by `{tool} info {self.path}`; if it is sound, cut it into shorter bags"
             elif self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
-                what = "the bag cannot be read: its folder has no metadata.yaml"
+                what = "the bag cannot be read, because its folder has no metadata.yaml"
             elif self.path.is_file() and not self.path.stat().st_size:
-                what, hint = "the bag cannot be read: it is empty (0 bytes)", "copy it again"
+                what, hint = "the bag cannot be read, because it is empty (0 bytes)", "copy it again from the recorder"
             allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
             raise DataError(what, where=str(self.path), allowed=allowed, hint=hint) from error
 
@@ -109,10 +109,12 @@ class OpenBag:
     def check_topic_is_one_of(self, name: str, known: Sequence[str], noun: str) -> None:
         """Raise `DataError` if the topic `name` is not among `known`. `noun` names the content of these topics."""
         if name not in known:
-            what = f"there are no {noun} on the topic '{name}'"
-            raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known))
+            what, otherwise = f"the bag has no {noun} on the topic '{name}'", "choose a topic that `--preview` lists"
+            raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known, otherwise))
 
-    def no_usable_topics_error(self, what: str, allowed: str, hint: str = "give another bag") -> DataError:
+    def no_usable_topics_error(
+        self, what: str, allowed: str, hint: str = "record such a topic too, or use the bag that has it"
+    ) -> DataError:
         """Return the `DataError` for a bag without usable topics. Its text lists the topics of the bag."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "none"
         return DataError(what, where=f"{self.path}, topics: {held}", allowed=allowed, hint=hint)
@@ -185,22 +187,25 @@ def _read_bag(
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):
-        what, allowed = f"pose_axis_point_distance is {distance:g} m", "a finite distance above 0 [m]"
-        raise DataError(what, where=f"--pose-axis-point-distance, for {path}", allowed=allowed)
+        what, allowed = f"pose_axis_point_distance is {distance:g} m, but must be above 0", "a finite distance [m]"
+        where, hint = f"--pose-axis-point-distance, for {path}", "use for example --pose-axis-point-distance 0.1"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     bag = _contents(path, tuple(at for at in options.point_names or () if ":" in at), progress, options.message_fields)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.point_names, str(path))
     if not groups and not seen and not bag.mounted:
         kinds = ", ".join((*_KNOWN, _TREES[0]))
         allowed = f"topics of the types {kinds}, or fields of any: --field position=/TOPIC.FIELD"
-        what, hint = "the bag has no joint states and no points", "add --field position=/TOPIC.FIELD"
+        what = "the bag has no topic with joint states, points or another known measurement"
+        hint = "record such topics, or name the array of joint positions: --field position=/TOPIC.FIELD"
         raise bag.file.no_usable_topics_error(what, allowed, hint)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
     seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     if unstamped := sum(message.stamp <= 0 for message in used_messages):
-        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp: all times are times of recording")
+        said = f"{unstamped} of {len(used_messages)} messages have no stamp"
+        more = (*more, f"{said}, so the times of all messages are those at which the bag recorded them")
     points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))
@@ -209,13 +214,15 @@ def _read_bag(
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = tuple(_mounted_sensors(bag, groups, seconds))
     if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP_NAME:
-        said = "the driver's estimate from joint torques, without the loads that it knows"
-        more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}: use it in place of efforts, not with them")
+        said = "the driver's estimate from the joint torques, without the loads that it knows"
+        more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}. Use it in place of the efforts, not with them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
-        more = (*more, f"orientations of {', '.join(sorted(turned))} were left out: no pose_axis_point_distance is set")
-    left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
+        said = f"the orientations of {', '.join(sorted(turned))} were left out"
+        more = (*more, f"{said}. To keep them as points, add --pose-axis-point-distance 0.1")
+    said = ((t.name, f"{t.kind}, {t.n_messages} messages") for t in bag.file.topics if t.name not in used)
+    left = [f"{name} was left out ({content})" for name, content in said]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
@@ -234,11 +241,13 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
             owners.setdefault(joint, set()).add(message.source)
     if shared := {topic for topics in owners.values() if len(topics) > 1 for topic in topics}:
         options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
-        notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of these topics")
+        notes.append(f"{', '.join(sorted(shared))} have joints in common. Choose one of these topics by --joint-topic")
     elif len(states) > 1:
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
-        notes.append("poses have orientations: --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
+        notes.append(
+            "poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along the axes"
+        )
     units, why = base.guess_non_si_units(_for_guess(bag))
     options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
@@ -297,11 +306,15 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
         if not path:
-            hint = f"write --field {channel}={topic}.FIELD"
-            raise DataError(f"the entry of '{channel}' names no field", where=where, allowed=allowed, hint=hint)
+            what, hint = (
+                f"'{channel}={topic}' names a topic, but no field of it",
+                f"write --field {channel}={topic}.FIELD",
+            )
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
     if len(topics) > 1 or (fields and "position" not in fields):
-        what = f"the fields belong to {len(topics)} topics" if len(topics) > 1 else "the channel position has no field"
-        hint = "choose fields of one topic" if len(topics) > 1 else "add --field position=/TOPIC.FIELD"
+        what, hint = "the channel position has no field", f"add --field position={topics[0]}.FIELD"
+        if len(topics) > 1:
+            what, hint = f"the fields belong to several topics: {', '.join(topics)}", f"use fields of {topics[0]} only"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return next(iter(topics), ""), {channel: path for channel, (_, _, path) in split.items()}
 
@@ -404,13 +417,15 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         messages = [message for message in bag.states if message.source == topic]
         sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
         if wanted is None and len(sets) > 1:
-            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints of one set"
-            allowed = "one of the sets: " + "; ".join(", ".join(names) for names in sets.values())
-            raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=f"{hint}: --joints NAME,NAME")
+            what = f"the messages of {topic} have {len(sets)} different sets of joints"
+            allowed = "joints of one of the sets " + "; ".join(", ".join(names) for names in sets.values())
+            hint = f"choose joints of one set: --joints {','.join(next(iter(sets.values())))}"
+            raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=hint)
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
         if len(kept) < len(messages) and names:
-            notes.append(f"{len(messages) - len(kept)} of {len(messages)} messages of {topic} lack a joint: skipped")
+            said = f"{len(messages) - len(kept)} of {len(messages)} messages of {topic}"
+            notes.append(f"{said} were left out, because they lack a joint")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
             found.append(_States(topic, names, renamed, kept))
@@ -419,8 +434,9 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         names = tuple(name for entry in found for name in entry.names)
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
-            allowed, hint = f"messages with {', '.join(names) or 'the joints'}", "choose another --command-topic"
-            raise DataError(f"no message of '{command}' has all joints", where=where, allowed=allowed, hint=hint)
+            allowed, hint = f"messages with {', '.join(names) or 'the joints'}", "choose another --command-topic TOPIC"
+            what = f"no message of '{command}' has commands for all joints"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 
@@ -436,12 +452,13 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
     allowed = "; ".join(dict.fromkeys(", ".join(names) for names in sets)) or "no joints were recorded"
     for name in wanted:
         if name not in known:
-            hint = nearest_name_question(name, known) or "choose recorded joints: --joints NAME,NAME"
+            hint = nearest_name_question(name, known) or f"choose recorded joints: --joints {','.join(known[:2])}"
             raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
-        what, allowed = "no message has all the chosen joints", f"joints of one of these sets: {allowed}"
-        raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
+        what, allowed = "no message has all the chosen joints", f"joints of one of the sets {allowed}"
+        hint = f"choose joints of one set: --joints {','.join(next(iter(sets), ()))}"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _on_one_clock(
@@ -450,7 +467,8 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    together, notes = base.joints_on_fastest_clock(made, where, "choose topics: --joint-topic TOPIC, once for each")
+    hint = f"choose topics that belong together: --joint-topic {groups[0].topic}"
+    together, notes = base.joints_on_fastest_clock(made, where, hint)
     for entry in (entry for entry in groups if entry.command):
         group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
         # each command is held until the next; before the first command, the first one is used
@@ -476,11 +494,11 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
         if rows and len(rows) < len(states):
             what = f"{len(states) - len(rows)} of {len(states)} messages lack '{channel}'"
             allowed = "a channel in all messages, or in none"
-            raise DataError(what, where=where, allowed=allowed, hint="choose another topic with --joint-topic")
+            raise DataError(what, where=where, allowed=allowed, hint="choose another topic: --joint-topic TOPIC")
         if rows and not np.isnan(rows).all():
             channels[channel] = np.array(rows)
     if "position" not in channels:
-        allowed, hint = "messages whose `position` is filled", "choose another topic with --joint-topic"
+        allowed, hint = "messages whose `position` is filled", "choose another topic: --joint-topic TOPIC"
         raise DataError("the joint states have no positions", where=where, allowed=allowed, hint=hint)
     values = np.hstack([t[:, None], *channels.values()])
     own = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))  # a message that is sent twice counts once
@@ -557,9 +575,9 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
-    becomes, note = "", "type is not supported; for joint values: --field position=TOPIC.FIELD"
+    becomes, note = "", f"its type is not known. For joint values, add --field position={topic.name}.FIELD"
     if topic.kind in OTHER_JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
-        note = f"joints, left out because the bag has joint states: --joint-topic {topic.name}"
+        note = f"joints, left out because the bag has joint states. To use them: --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
@@ -571,7 +589,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
         becomes, note = f"{_GROUP_BY_MESSAGE_TYPE[topic.kind]} on {frames or topic.name}", ""
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
-        note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
+        note = f"frames {', '.join(children)}. To use one: --points {topic.name}:FRAME=POINT"
     return base.TopicOrColumnSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
 
 

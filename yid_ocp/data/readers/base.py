@@ -73,7 +73,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
-            said = unknown_name_error_arguments(word, chain(*_TO_SI.values()))
+            said = unknown_name_error_arguments(word, chain(*_TO_SI.values()), "write for example --units deg,mm")
             raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
         own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or word not in MOTOR_CURRENT_UNITS)]
         for quantity in own:
@@ -97,11 +97,13 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
             what = f"a unit is given for '{quantity}', which is not the name of a quantity"
-            raise DataError(what, where=f"--units, for {where}", **unknown_name_error_arguments(quantity, _QUANTITIES))
+            said = unknown_name_error_arguments(quantity, _QUANTITIES, f"write for example --units position={unit}")
+            raise DataError(what, where=f"--units, for {where}", **said)
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
-            raise DataError(what, where=where, **unknown_name_error_arguments(unit, names))
+            said = unknown_name_error_arguments(unit, names, f"write for example --units {quantity}={names[-1]}")
+            raise DataError(what, where=where, **said)
         factors[quantity] = known[_spaceless(unit)]
     return factors
 
@@ -113,7 +115,7 @@ def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
         if not recorded or not name:
-            allowed, hint = "NAME, or RECORDED=NAME of a joint", "add the name, or leave the entry out"
+            allowed, hint = "NAME, or RECORDED=NAME of a joint", "write for example --joints q1=shoulder,q2=elbow"
             raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
             what, allowed = f"the joint '{name}' is chosen twice", "every joint once"
@@ -180,7 +182,7 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     """Raise `DataError` if `chosen` maps two data sources to the same point name."""
     names = list(chosen.values())
     if shared := [source for source, name in chosen.items() if names.count(name) > 1]:
-        what = f"points have the same name: {', '.join(f'{source} as {chosen[source]}' for source in shared)}"
+        what = f"points have the same name ({', '.join(f'{source} as {chosen[source]}' for source in shared)})"
         hint = ",".join(f"{source}=NAME{i + 1}" for i, source in enumerate(shared[:4])) + ",..." * (len(shared) > 4)
         raise DataError(what, where=where, allowed="one name for each point", hint=f"rename them: --points {hint}")
 
@@ -192,10 +194,12 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
                 what = f"{word} has a value for '{pattern}', but no joint has this name"
-                raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
+                said = unknown_name_error_arguments(pattern, names, f"leave '{pattern}' out, or write * for all joints")
+                raise DataError(what, where=where, **said)
             if not (math.isfinite(value) and value != 0):
-                allowed = "a finite number that is not zero"
-                raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed=allowed)
+                what, allowed = f"{word} of '{pattern}' is {value:g}", "a finite number that is not zero"
+                hint = f"write for example --{word.replace('_', '-')} {pattern}=0.1"
+                raise DataError(what, where=where, allowed=allowed, hint=hint)
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
             what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"
@@ -223,18 +227,18 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
         widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
         if widest > _MAX_PLAUSIBLE_VALUES["position"]:
             units["position"] = "deg"
-            notes.append(f"angles reach {widest:.3g}: they look like degrees")
+            notes.append(f"angles reach {widest:.3g}, so they seem to be in degrees")
     farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
     if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
-        notes.append(f"points reach {farthest:.3g}: they look like millimetres")
+        notes.append(f"coordinates of points reach {farthest:.3g}, so they seem to be in millimetres")
     for group in recording.joint_and_point_groups:
         period = median_sample_period(group.t)
         unit = next((unit for unit, least in (("ns", 1e4), ("us", 200.0), ("ms", 0.5)) if period > least), "")
         slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds
         if unit and not slow and "t" not in units:
             units["t"] = unit
-            notes.append(f"samples come every {period:.3g}: the times look like {unit}")
+            notes.append(f"samples come every {period:.3g}, so the times seem to be in {unit}")
     return units, tuple(notes)
 
 
@@ -255,8 +259,8 @@ def joints_on_fastest_clock(
     name, clock = max(groups, key=lambda source: len(source[1].t) / max(np.ptp(source[1].t), 1e-12))
     kept = np.all([_can_interpolate(group.t, clock.t) for _, group in groups], axis=0)
     if not kept.any():
-        listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
-        what = f"the joints were never recorded at the same time: {listed}"
+        listed = ", ".join(f"{name} from {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
+        what = f"the joints were never recorded at the same time ({listed})"
         raise DataError(what, where=where, allowed="joints whose times overlap", hint=hint)
     t = clock.t[kept]
 
@@ -267,9 +271,10 @@ def joints_on_fastest_clock(
     channels: dict[str, Any] = {channel: joined(channel) for channel in clock.values_by_channel}
     notes = []
     if moved := [source for source, group in groups if not np.isin(t, group.t).all()]:
-        notes.append(f"joint states of {', '.join(moved)} were interpolated to the times of {name}")
+        notes.append(f"the joint states of {', '.join(moved)} were interpolated to the times of {name}")
     if len(t) < len(clock.t):
-        notes.append(f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name} were omitted in gaps of others")
+        said = f"{len(clock.t) - len(t)} of {len(clock.t)} samples of {name}"
+        notes.append(f"{said} were left out, because another source has a gap or no data there")
     names = tuple(joint for _, group in groups for joint in group.names)
     return replace(clock, names=names, t=t, **channels), tuple(notes)
 

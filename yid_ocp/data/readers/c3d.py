@@ -76,7 +76,11 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
         seen = np.isfinite(found.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
-    notes = [f"the file states the unit {found.unit}"] if found.unit else ["the file states no unit: set --units mm?"]
+    notes = (
+        [f"the file states the unit {found.unit}"]
+        if found.unit
+        else ["the file states no unit. Its lengths are taken to be in metres; if they are in mm, add --units mm"]
+    )
     return base.FilePreview((*sources, *found.others), {"point_names": {n: n for n in found.names}}, tuple(notes))
 
 
@@ -97,10 +101,10 @@ def _markers(path: Path) -> _Markers:
         raise _unreadable(path) from error
     if not rate > 0 or not len(position) or not labels:
         what = "the C3D file has no labelled markers" if not labels else "the C3D file has no frames or no frame rate"
-        hint = "export it again with the trajectories of the markers"
+        hint = "label the markers in the capture program, and export the file again with their trajectories"
         raise DataError(what, where=str(path), allowed="labelled 3-D points and their frame rate", hint=hint)
     if unit and unit not in _LENGTH_UNITS:
-        what, hint = f"the unit of the markers is '{unit}'", "export it again in one of these units"
+        what, hint = f"the unit of the markers is '{unit}', which is unknown", "export the file again in mm"
         raise DataError(what, where=str(path), allowed=", ".join(_LENGTH_UNITS), hint=hint)
     position = position[:, : len(labels)]
     unseen = (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
@@ -113,7 +117,8 @@ def _markers(path: Path) -> _Markers:
             why[i] = reason or "never seen"
     kept = [i for i in range(len(labels)) if i not in why]
     if not kept:
-        what = "the C3D file has no usable marker: " + ", ".join(f"{n} {r}" for r, n in Counter(why.values()).items())
+        left = ", ".join(f"{n} {r}" for r, n in Counter(why.values()).items())
+        what = f"the C3D file has no usable marker ({left})"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label markers, and export again")
     others = []
     for i, reason in why.items():
@@ -136,9 +141,9 @@ def _complaint(path: Path) -> str:
 
 
 def _unreadable(path: Path) -> DataError:
-    why = "it is damaged, cut off or of another format" if path.stat().st_size else "it is empty"
+    why = "it is damaged, cut off or of another format" if path.stat().st_size else "it is empty (0 bytes)"
     allowed, hint = "a C3D file that Vicon, Qualisys or OptiTrack exported", "copy the file again, or export it again"
-    return DataError(f"the C3D file cannot be read: {why}", where=str(path), allowed=allowed, hint=hint)
+    return DataError(f"the C3D file cannot be read, because {why}", where=str(path), allowed=allowed, hint=hint)
 
 
 def _listed(group: Mapping[str, Any], key: str) -> list[str]:

@@ -84,8 +84,8 @@ def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) ->
     said = options.description, path.name, path.stem, file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
         if options.column_meanings:
-            what = "this is a motion capture export, whose header names its columns"
-            allowed, hint = "no --columns", "leave --columns out, and choose markers with --points MARKER=POINT"
+            what = "--columns is given, but the file is a motion capture export, whose header gives the meanings"
+            allowed, hint = "no --columns", "leave --columns out, and choose markers by --points MARKER=POINT"
             raise DataError(what, where=str(path), allowed=allowed, hint=hint)
         seen, unit, remarks = capture
         sensor = seen.sensor_name if options.point_sensor_name == "unknown" else options.point_sensor_name
@@ -195,7 +195,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
-        hint = "set the --delimiter between its columns; --preview shows how the columns are read"
+        hint = "set the character between its columns, such as --delimiter ';' (--preview shows the columns)"
         raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
     text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
@@ -219,13 +219,13 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: meaning unknown"
         rate = mean_sample_rate(t) if ok else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
-    notes = [f"{bad} of {n_lines} lines are not rows of numbers"] if bad else []
+    notes = [f"{bad} of {n_lines} lines are not rows of numbers. --skip-bad-lines leaves them out"] if bad else []
     clean = table[np.isfinite(t)]
     try:
         units, why = base.guess_non_si_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
-    notes += [f"{quantity} is in {unit}, by the header" for quantity, unit in stated]
+    notes += [f"the header states that {quantity} is in {unit}" for quantity, unit in stated]
     guessed = [own for own in zip(units.items(), why, strict=True) if own[0][0] not in dict(stated)]
     if guessed:
         options["units"] = dict(own for own, _ in guessed)
@@ -243,8 +243,8 @@ _OR_SKIP = ", or skip such lines with --skip-bad-lines"
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every nonempty line."""
     if len(delimiter) != 1:
-        hint = "set one character, such as --delimiter ';'"
-        raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character", hint=hint)
+        what, hint = f"the delimiter is {delimiter!r}, but must be one character", "set for example --delimiter ';'"
+        raise DataError(what, where=str(path), allowed="one character, such as , ; or tab", hint=hint)
     try:
         with check_input_file(path).open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
@@ -253,13 +253,13 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 count += len(cells) + _LINE_COST
                 check_not_too_many_numbers(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
-                    what, hint = f"the table has {len(cells)} columns", "check the --delimiter: comma, semicolon or tab"
+                    what, hint = f"the table has {len(cells)} columns, more than {_MAX_COLUMNS}", "set --delimiter ';'"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
                 # `sep=` tells Excel the delimiter
                 if any(map(str.strip, cells)) and not cells[0].lstrip().startswith(("#", "sep=")):
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        what, hint = f"the file is not a table in UTF-8 text ({error})", "export it as CSV in UTF-8"
+        what, hint = f"the file is not a table in UTF-8 text ({error})", "export the file again as CSV in UTF-8"
         if isinstance(error, OSError):
             what, hint = f"the file cannot be read ({os_error_reason(error)})", "copy it again from its source"
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8", hint=hint) from error
@@ -283,7 +283,7 @@ def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
     while line := file.readline(_MAX_LINE_LENGTH + 1):
         if len(line) > _MAX_LINE_LENGTH:
             what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
-            raise DataError(what, where=str(path), allowed=allowed, hint="export the measurements as CSV")
+            raise DataError(what, where=str(path), allowed=allowed, hint="export the measurements again as CSV")
         yield line
 
 
@@ -310,33 +310,35 @@ def _read_table(
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     if not len(table):
         allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
-        raise DataError("the table has no rows", where=str(path), allowed=allowed, hint=hint)
+        raise DataError("the table has no rows below its header", where=str(path), allowed=allowed, hint=hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:
         what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers"
         where = f"{path}, line {bad[0]}" + (" and later lines" if len(bad) > 1 else "")
-        hint = "set the --delimiter, or leave columns of text out: --columns NAME=skip (see --preview)"
+        hint = "set the delimiter, as in --delimiter ';', or leave a column of text out: --columns NAME=skip"
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        notes = (f"{len(bad)} of {n_lines} lines were left out: not rows of numbers (line {listed})",)
+        notes = (f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
 def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> None:
     if not any(header):
-        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint="export it again")
+        hint = "export the measurements again, with a header and rows"
+        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint=hint)
     if options.has_header and all(_is_number(cell) for cell in header):
-        hint = "add --no-header --columns t,position:JOINT,... with one meaning for every column"
+        hint = "add --no-header --columns t,position:JOINT,... with a meaning (or skip) for every column"
         raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
         others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
         hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
-        raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
+        what = f"the table has only one column, '{header[0]}'"
+        raise DataError(what, where=str(path), allowed=_ALLOWED, hint=hint)
     name, count = Counter(header).most_common(1)[0]
     if options.has_header and count > 1:
-        allowed, hint = "different names for all columns", "rename one of them, or read the table with --no-header"
+        allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
         raise DataError(f"two columns are called '{name}'", where=f"{path}, line 1", allowed=allowed, hint=hint)
 
 
@@ -365,15 +367,17 @@ def _parsed_number(cell: str) -> float:
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        what, allowed = f"the row has {len(cells)} cells", f"{len(header)} cells, as in the header"
+        what = f"the row has {len(cells)} cells, but the header has {len(header)}"
+        allowed = f"{len(header)} cells in every row"
         hint = f"correct the row{_OR_SKIP}"
         if len(cells) > len(header):
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
     if any("," in cell for cell in values) and any("." in cell for cell in values):
-        what, allowed = "the row has decimal commas and decimal points", "one of both, and no thousands separators"
-        raise DataError(what, where=where, allowed=allowed, hint=f"export the table again{_OR_SKIP}")
+        what, allowed = "the row has numbers with commas and numbers with points", "decimal commas or decimal points"
+        hint = f"export the table again with decimal points and without thousands separators{_OR_SKIP}"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
         if meaning:
@@ -382,7 +386,8 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             except ValueError as error:
                 allowed = "a number, or an empty cell if there was no measurement"
                 allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
-                what, hint = f"column '{name}' has the cell '{cell}'", f"correct or empty the cell{_OR_SKIP}"
+                what = f"the cell '{cell}' in column '{name}' is not a number"
+                hint = f"correct or empty the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
@@ -399,7 +404,8 @@ def _meanings(
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
-            raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
+            said = unknown_name_error_arguments(key, header, f"leave '{key}' out of --columns")
+            raise DataError(f"there is no column '{key}'", where=where, **said)
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: dict[str, ColumnMeaning] = {}
@@ -409,8 +415,8 @@ def _meanings(
     for quantity, unit in stated:
         both = units.setdefault(quantity, unit), unit
         if len({base.factor_to_si_by_quantity({quantity: one}, where)[quantity] for one in both}) > 1:
-            what, allowed = f"columns of {quantity} are in {' and in '.join(both)}", "one unit for every quantity"
-            raise DataError(what, where=where, allowed=allowed, hint="convert them to one unit in the file")
+            what, allowed = f"some columns of {quantity} are in {both[0]}, others in {both[1]}", "one unit per quantity"
+            raise DataError(what, where=where, allowed=allowed, hint=f"convert all of them to {both[0]} in the file")
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given:
@@ -426,8 +432,10 @@ def _meanings(
             raise DataError(what, where=where, allowed="one column for every meaning", hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
-        allowed, hint = "a column named t or time, in seconds", "name the column of times: --columns NAME=t"
-        raise DataError("the table has no column of times", where=where, allowed=allowed, hint=hint)
+        names = [name for name in header if name]
+        what = f"the table has no column of times; its columns are {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
+        hint = f"name the column of times, for example --columns '{names[0]}=t'"
+        raise DataError(what, where=where, allowed="a column named t or time, in seconds", hint=hint)
     return list(meanings.values()), units
 
 
@@ -442,8 +450,8 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
-        hint = nearest_name_question(kind, known) or f"{column}=position:JOINT"
-        hint = f"{column}={kind}:NAME" if kind in known else hint
+        hint = nearest_name_question(kind, known) or f"write for example --columns '{column}=position:JOINT'"
+        hint = f"write --columns '{column}={kind}:NAME'" if kind in known else hint
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
@@ -452,7 +460,7 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     places = {meaning: i for i, meaning in enumerate(meanings)}
     for meaning in wanted:
         if meaning not in places:
-            what, skip = f"there is no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
+            what, skip = f"the table has no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
             allowed = "every channel for all joints (position is required); x, y and z of every point and sensor"
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column

@@ -145,11 +145,13 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
     if widest <= _MAX_RADIANS and not of:
         return
-    what = f"the unit of the joint positions is unknown: the largest absolute value is {widest:.3g}{of}"
-    allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "--units deg"
+    what = f"the unit of the joint positions is unknown; the largest absolute value is {widest:.3g}{of}"
+    allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "add --units deg"
     if widest <= _MAX_NORMALISED:
-        hint = "--units deg only if the robot was recorded with use_degrees=true. If not, the values are normalised "
-        hint += "(-100 to 100) and cannot be converted: record again with use_degrees=true"
+        hint = (
+            "add --units deg only if the robot was recorded with use_degrees=true. If not, the values are normalised "
+        )
+        hint += "(-100 to 100) and cannot be converted, so record again with use_degrees=true"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -163,16 +165,17 @@ def _dataset(folder: Path) -> _Dataset:
         key, allowed = ".".join(map(str, wrong["loc"])), "an object with codebase_version, fps and features"
         if key:
             allowed = _Info.model_fields[str(wrong["loc"][0])].description or "text"
-        what = f"{key or 'the content'} = {json.dumps(wrong['input'])[:60]} is not allowed"
+        what = f"{key or 'the content'} is {json.dumps(wrong['input'])[:60]}, which is not allowed"
         what = f"the key '{key}' is missing" if wrong["type"] == "missing" else what
         raise DataError(what, where=f"{where}: {key}" if key else where, allowed=allowed, hint=hint) from error
     version = info.codebase_version
     if version not in _VERSIONS:
-        what = f"the dataset has the version {version}"
+        what = f"the dataset has the version {version}, which cannot be read"
         raise DataError(what, where=f"{where}: codebase_version", allowed=", ".join(_VERSIONS), hint=hint)
     if _STATE not in info.features:
-        said = {"allowed": f"features with {_STATE}", "hint": "record the dataset with the state of a robot"}
-        raise DataError(f"the dataset has no {_STATE}", where=f"{where}: features", **said)
+        what, allowed = f"the dataset has no {_STATE}, the measured joint positions", f"features with {_STATE}"
+        hint = "record the dataset again with the state of the robot"
+        raise DataError(what, where=f"{where}: features", allowed=allowed, hint=hint)
     return _Dataset(folder, info)
 
 
@@ -184,7 +187,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
     last = dataset.info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
     if episode < 0 or (last >= 0 and episode > last):
-        hint = "choose a recorded episode with --episode NUMBER"
+        hint = f"choose a recorded episode, such as --episode {max(last, 0)}"
         raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed, hint=hint)
     wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
     columns = [*wanted, "frame_index", "episode_index"]
@@ -196,12 +199,16 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
             found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
         except (arrow.ArrowException, OSError, KeyError, ValueError) as error:
-            what = "the table of the episode cannot be read: it is damaged or not a parquet file"
+            what = "the table of the episode cannot be read, because it is damaged or not a parquet file"
             hint, allowed = "download or copy the file again", f"a parquet file with {', '.join(columns)}"
             raise DataError(what, where=str(file), allowed=allowed, hint=hint) from error
         if len(found["frame_index"]):
             return found, file
-    raise DataError("no file has this episode", where=where, allowed=allowed, hint="download the whole dataset")
+    what, hint = (
+        f"no file of the dataset has episode {episode}",
+        "download the whole dataset, or choose another episode",
+    )
+    raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
@@ -220,7 +227,7 @@ def _files(dataset: _Dataset, episode: int) -> list[Path]:
     where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
     allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
     hint = "write data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-    raise DataError(f"data_path is '{pattern}'", where=where, allowed=allowed, hint=hint)
+    raise DataError(f"data_path is '{pattern}', which is not usable", where=where, allowed=allowed, hint=hint)
 
 
 def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
@@ -241,7 +248,7 @@ def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
             kind = kind.value_type
         if not (types.is_integer(kind) or types.is_floating(kind)):
             what = f"the column {name} contains {kind} instead of numbers"
-            hint = "convert the dataset again, or record it again"
+            hint = f"convert or record the dataset again, with numbers in {name}"
             raise DataError(what, where=where, allowed="numbers, or lists of numbers", hint=hint)
 
 
@@ -288,7 +295,7 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
         column = column.flatten()
     if n_lengths > 1 or len(column) < rows:
         what, allowed = f"the lists of column '{name}' differ in length", "lists of equal length in all frames"
-        hint = "find the frames with other lengths and remove them, or convert the dataset again"
+        hint = f"remove the frames in which {name} has another length, or convert the dataset again"
         raise DataError(what, where=str(folder), allowed=allowed, hint=hint)
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 

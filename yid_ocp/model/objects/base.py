@@ -68,21 +68,28 @@ class CableVertices:
     def __post_init__(self) -> None:
         free = self.main_branch_vertex_names[2:-2]
         if not free:
-            what = f"the main branch has {len(self.main_branch_vertex_names)} vertices"
-            allowed, hint = "5 or more: two are held at each end", "add vertices between the ends"
+            what = f"the main branch has {len(self.main_branch_vertex_names)} vertices, but must have 5 or more"
+            allowed, hint = "two vertices at each end, and one or more between them", "add vertices between the ends"
             raise ModelError(what, where="cable: main_branch_vertex_names", allowed=allowed, hint=hint)
         for name, vertices in self.child_branch_vertex_names.items():
             if len(vertices) < 2 or vertices[0] not in free:
-                what = f"branch '{name}' ({', '.join(vertices)}) is too short, or does not start on the main branch"
+                is_short, where = len(vertices) < 2, f"cable: child_branch_vertex_names.{name}"
+                why = (
+                    f"has {len(vertices)} vertices"
+                    if is_short
+                    else f"starts at '{vertices[0]}', not on the main branch"
+                )
                 allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
-                raise ModelError(what, where=f"cable: child_branch_vertex_names.{name}", allowed=allowed)
+                hint = f"list first the vertex at which '{name}' leaves the main branch, such as {free[0]}"
+                raise ModelError(f"branch '{name}' {why}", where=where, allowed=allowed, hint=hint)
         known = self.undeformed_positions
         require_known_names(self.vertex_names, known, "undeformed position of vertex", "cable", ModelError)
         if len(set(self.vertex_names)) != len(self.vertex_names):
             twice = max(self.vertex_names, key=self.vertex_names.count)
             branches = " and ".join(name for name, own in self.vertex_names_by_branch.items() if twice in own)
-            what, hint = f"vertex '{twice}' is listed twice: in {branches}", "remove it at one of the places"
-            raise ModelError(what, where="cable", allowed="every vertex in one branch", hint=hint)
+            what, hint = f"vertex '{twice}' is listed twice, in {branches}", "remove it at one of the places"
+            allowed = "every vertex once; only the first vertex of a branch is also one of the main branch"
+            raise ModelError(what, where="cable", allowed=allowed, hint=hint)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ class _SegmentGeometry:
     def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:
         """Build the segment `name`. Each link is divided into `link_division` links. The segment's stiffness stays."""
         if self.length is None and self.link_lengths is None:
-            what, hint = f"segment '{name}' has no length", "set length or link_lengths of the segment"
+            what, hint = f"segment '{name}' has no length", "set its length: 0.5, or link_lengths: [0.2, 0.3]"
             where = f"model.object.named_segments.{name}"
             raise ModelError(what, where=where, allowed="length or link_lengths [m]", hint=hint)
         n = link_division
@@ -119,7 +119,11 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     length, mass, radius = base.extract_required_object_numbers("each branch of a tree", numbers, wanted)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
-        raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="a whole number from 1 to 16")
+        what, hint = (
+            f"--branches is {count}, but must be from 1 to 16",
+            "describe each by --branch, or set --branches 4",
+        )
+        raise ConfigError(what, where="--branches", allowed="a whole number from 1 to 16", hint=hint)
     # perpendicular to the holder's z axis, the first one along its x axis
     turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
     branches = enumerate((_init_segment(links, length, mass, radius, rpy=turn) for turn in turns), 1)
@@ -139,7 +143,7 @@ def _grown(branches: Sequence[tuple[str, _SegmentGeometry]]) -> dict[str, _Segme
     for name, branch in branches:
         if name in made:
             what, allowed = f"two branches are called '{name}'", "a name of its own for each branch"
-            raise ConfigError(what, where="--branch", allowed=allowed, hint="rename one of them")
+            raise ConfigError(what, where="--branch", allowed=allowed, hint=f"rename one of them to '{name}_2'")
         if branch.parent is not None and branch.parent not in made:
             what = f"branch '{name}' grows on '{branch.parent}', which is not an earlier branch"
             allowed, hint = ", ".join(made) or "a branch without @PARENT", "put the --branch of the parent before it"
@@ -158,7 +162,8 @@ def _branch(text: str, links: int) -> tuple[str, _SegmentGeometry]:
     values = base.parse_comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
         what, allowed = f"'{text}' has a size that is not above 0", "length [m], mass [kg] and radius [m] above 0"
-        raise ConfigError(what, where="--branch", allowed=allowed)
+        hint = "write for example --branch left=0.4,0.03,0.008"
+        raise ConfigError(what, where="--branch", allowed=allowed, hint=hint)
     turn = (values[3], values[4], values[5]) if count == 6 else _NO_TURN
     return name, _init_segment(links, values[0], values[1], values[2], rpy=turn, parent=parent or None)
 
