@@ -44,17 +44,15 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         if isinstance(error, ValueError):
             what, allowed = "the path contains a null character", "a path without null characters"
         near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
-        why = "its folder has no file of a similar name" if near else "its folder is missing, empty or not readable"
-        hint = nearest_name_question(path.name, near) or (f"correct the path: {why}" if absent else "correct the path")
+        hint = nearest_name_question(path.name, near) or f"correct the path: `ls {path.parent}` lists its folder"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
         hint = f"allow reading by `chmod u+r {path}`, or copy the file to a folder of your own"
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
     if not stat.S_ISREG(info.st_mode):
-        what, hint = "this path is a pipe or a device, but must be a file", "copy its output into a file"
-        if stat.S_ISDIR(info.st_mode):
-            what, hint = "this path is a folder, but must be a file", f"give the path of a file in it: {path / 'NAME'}"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
+        noun = "folder" if stat.S_ISDIR(info.st_mode) else "pipe or a device"
+        hint = f"use the path of a file, such as {path / 'NAME'}" if path.is_dir() else "copy its output into a file"
+        raise DataError(f"this is a {noun}, but must be a file", where=str(path), allowed=allowed, hint=hint)
     if max_bytes is not None and info.st_size > max_bytes:
         most = f"{max_bytes / 2**20:.3g} MiB"
         what, hint = f"the file has {info.st_size / 2**20:.3g} MiB, more than {most}", "give another or a smaller file"
@@ -87,10 +85,9 @@ def limit_process_memory() -> Iterator[None]:
 def check_not_too_many_numbers(count: int, where: str) -> None:
     """Raise `DataError` if an input file contains or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
-        most = f"{MAX_INPUT_NUMBERS / 1e6:.0f} million"
-        what = f"the file holds {count / 1e6:.0f} million numbers, more than {most}"
-        hint = "cut it into several shorter recordings"
-        raise DataError(what, where=where, allowed=f"at most {most} numbers", hint=hint)
+        allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
+        what = f"the file holds {count / 1e6:.0f} million numbers, more than allowed"
+        raise DataError(what, where=where, allowed=allowed, hint="cut it into several shorter recordings")
 
 
 def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -100,8 +97,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = os_error_reason(error) if isinstance(error, OSError) else "it is not UTF-8 text"
-        hint = "save it as UTF-8, for example by `iconv -f latin1 -t utf-8 FILE > NEW_FILE`"
-        hint = "copy it again from its source" if isinstance(error, OSError) else hint
+        hint = "copy it again from its source" if isinstance(error, OSError) else "save it again as UTF-8 text"
         what, allowed = f"the file cannot be read ({reason})", "readable text in UTF-8"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
 
@@ -126,8 +122,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
         what, allowed = "the folder to write to does not exist", "a file in an existing folder"
         hint = f"create the folder by `mkdir -p {path.parent}`, or correct the path"
         if path.is_dir():
-            what, allowed = "this path is a folder, but a file is to be written", "the path of a file"
-            hint = f"write to {path / 'NAME'}{path.suffix}"
+            what, allowed, hint = "this path is a folder", "the name of a file", f"use {path / 'NAME'}{path.suffix}"
         raise OutputError(what, where=str(path), allowed=allowed, hint=hint)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -161,9 +156,8 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         file = next((part for part in (path, *path.parents) if is_file(part)), None)
-        why, hint = f"({os_error_reason(error)})", "choose a folder that you can write to, such as one in your home"
-        if file is not None:
-            why, hint = f"because {file} is a file", f"choose another folder, or rename {file}"
+        why = f"because {file} is a file" if file else f"({os_error_reason(error)})"
+        hint = "choose another folder, in which you may write" + (f", or rename {file}" if file else "")
         raise OutputError(f"{what} cannot be made {why}", where=str(path), hint=hint) from error
     return path
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import operator
 import types
 from collections.abc import Callable, Iterable, Mapping
@@ -142,10 +141,8 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 
 def default_value_hint(key: str, default: Any) -> str:
-    """Return the advice to write the default of an option, to leave it out, or (if it is required) an allowed value."""
-    if isinstance(default, (int, float, str)):
-        return f"write an allowed value, such as the default {key}: {json.dumps(default)}"
-    return f"write an allowed value for {key}" + ("" if default is MISSING else f", or leave {key} out")
+    """Return the advice to set an option to an allowed value, or to its default if it has one."""
+    return f"set {key} to an allowed value" + f", such as {default}" * isinstance(default, (int, float, str))
 
 
 def _within(hint: Any, value: Any) -> bool:

@@ -56,7 +56,7 @@ def edited(file, old, new):
         ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
         ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "converted from ms")),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "agrees with")),
+        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "such as 0.01")),
         ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "from 0 to inf N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("upper bound of 0.5 N", "0 to 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("upper bound of 100 N", "0 to 100 N m/rad")),
@@ -84,9 +84,9 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 def test_no_such_configuration(cli, pendulum):
     folder = pendulum.parent
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
-    assert_refused(cli("check", folder), "this path is a folder", "a YAML file")
+    assert_refused(cli("check", folder), "this is a folder, but must be a file", "a YAML file")
     (folder / "list.yaml").write_text("- 1\n")
-    assert_refused(cli("solve", folder / "list.yaml"), "keys with values")
+    assert_refused(cli("solve", folder / "list.yaml"), "but no keys")
     (folder / "latin.yaml").write_bytes(b"description: \xe9\n")
     assert_refused(cli("solve", folder / "latin.yaml"), "UTF-8")
 
@@ -112,11 +112,11 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
     [
         (lambda j: setitem(j["effort"], (5, 1), np.nan), ("'effort' has 1 missing", "joint 'elbow' at t = 0.05 s")),
         (lambda j: setitem(j["t"], 7, j["t"][5]), ("the clock does not advance", "index 6", "strictly increasing")),
-        (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg', but must be 'rad'", "rad", "convert")),
+        (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg', but must be 'rad'", "convert")),
         (lambda j: setitem(j["position"], ..., np.rad2deg(j["position"][...]) + 90), ("degrees", "rad")),
         (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?")),
         (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement",)),
-        (lambda j: delitem(j.attrs, "effort_std"), ("noise level", "sensors.joints.effort.std")),
+        (lambda j: delitem(j.attrs, "effort_std"), ("deviation of the noise", "sensors.joints.effort.std")),
     ],
     ids=["nan", "backwards", "deg", "degrees unsaid", "another joint", "no effort", "no noise"],
 )

@@ -91,7 +91,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
     [
         ("model:\n  object: {links: 4}\n", ["line 2: model.object"]),
         ("model:\n  object: {kind: cube}\n", ["there is no kind 'cube'"]),
-        ("model:\n  object: 3\n", ["model.object is 3, but must be a section"]),
+        ("model:\n  object: 3\n", ["model.object = 3 is not a section"]),
         ("model: {object: {kind: segments, named_segments: {a: {length: 1, radius: 0.1}}}}", ["'mass' is missing"]),
         ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
         ("model:\n  grasp: [left]\n", ["model.grasp"]),
@@ -183,8 +183,8 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
     ("setting", "words"),
     [
         ("sensors.points.sdt=3", ["there is no key 'sdt'", "did you mean 'std'?"]),
-        ("sensors.camera.sdt=3", ["sensors.camera.sdt is 3, but must be a section", "did you mean 'sensors.camera.std'?"]),
-        ("parameters.T2.bend=5", ["must be a section", "add a key, as in parameters.T2.bend.initial"]),
+        ("sensors.camera.sdt=3", ["sensors.camera.sdt = 3 is not a section", "did you mean 'sensors.camera.std'?"]),
+        ("parameters.T2.bend=5", ["is not a section", "add a key, as in parameters.T2.bend.initial"]),
         ("sensors={points: {sdt: 3}}", ["there is no key 'sdt' in sensors.points", "'std'?"]),
         ("parameters.T2.bend.free=maybe", ["true or false"]),
         ("compare.methods.gauss_newton.max_iterations=abc", ["a whole number from 1"]),

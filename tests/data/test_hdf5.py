@@ -153,7 +153,7 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "format no text": (lambda f: f.attrs.create("format", 1), "the value 1 is not text", ""),
     "format not UTF-8": (lambda f: f.attrs.create("format", np.bytes_(b"\xff\xfe")), "not UTF-8", ""),
     "group": (lambda f: f.move("joints", "joint"), "unknown group, 'joint'", "did you mean 'joints'"),
-    "dataset at the top": (lambda f: f.create_dataset("points", data=[1.0]), "'points' is a dataset, but must be a group", ""),
+    "dataset at the top": (lambda f: f.create_dataset("points", data=[1.0]), "'points' is a dataset, but must be", ""),
     "dataset": (lambda f: f.move("joints/effort", "joints/efort"), "unknown dataset, 'efort'", "did you mean 'effort'"),
     "dataset of points": (lambda f: f.move("points_arm/position", "points_arm/xyz"), "unknown dataset, 'xyz'", ""),
     "attribute": (lambda f: f["joints"].attrs.create("effrt_std", 1.0), "unknown attribute, 'effrt_std'", "effort_std"),

@@ -152,7 +152,7 @@ THREE = *TWO, link("c")
 BROKEN = {
     "floating": ((*TWO, joint("j", "a", "b", "floating")), ["'j'", "'floating'", "prismatic"]),
     "planar": ((*TWO, joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
-    "zero_axis": ((*TWO, joint("j", "a", "b", axis="0 0 0")), ["axis of joint 'j' is 0 0 0", "axis other than 0 0 0", "write"]),
+    "zero_axis": ((*TWO, joint("j", "a", "b", axis="0 0 0")), ["joint 'j' is 0 0 0", "axis other than 0 0 0", "write"]),
     "two_roots": (TWO, ["2 root links", "exactly one"]),
     "no_root": ((*TWO, joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
     "unknown_link": ((link("base"), link("b"), joint("j", "bas", "b")), ["'j'", "'bas'", "'base'"]),
@@ -162,7 +162,7 @@ BROKEN = {
     ),
     "twice_the_joint": ((*THREE, joint("j", "a", "b"), joint("j", "b", "c")), ["two joints are called 'j'"]),
     "ring_beside": ((*THREE, joint("j", "c", "b"), joint("k", "b", "c")), ["'b' is not connected to the root"]),
-    "xacro": ((*TWO, '<x:tip xmlns:x="http://www.ros.org/wiki/xacro"/>'), ["xacro macros", ".urdf > robot.urdf`"]),
+    "xacro": ((*TWO, '<x:tip xmlns:x="http://www.ros.org/wiki/xacro"/>'), ["unexpanded xacro", ".urdf > robot.urdf`"]),
     "nan_mimic": ((*TWO, joint("j", "a", "b").replace("<limit", '<mimic offset="nan"/><limit')), ["offset is 'nan'"]),
     "truncated": ((link("a"), "<link name="), ["cannot be read"]),
     "negative_moment": (with_tip(moments=(1, -2, 1)), ["negative moment of inertia"]),

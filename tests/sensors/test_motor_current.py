@@ -151,9 +151,13 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "torque constant of joint 'shoulder' is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "'shoulder' has no value"),
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "standard deviation of the noise of the motor currents"),
-        (KNOWN, {"names": ("elbow", "sholder")}, "'sholder', which is no joint of the model"),
+        (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder', whose current is recorded"),
         (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),
-        (KNOWN, {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}}, "0 s of motors_left.current are too short"),
+        (
+            KNOWN,
+            {"t": T[:1], "values_by_quantity": {"current": np.zeros((1, 2))}},
+            "0 s of motors_left.current are too",
+        ),
         (
             KNOWN,
             {"t": T[:20], "values_by_quantity": {"current": np.zeros((20, 2))}},

@@ -136,9 +136,8 @@ def _loaded(text: str, origin: str) -> Any:
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Convert the YAML reader's values to plain Python values, and store their lines in `places`."""
     if len(path) > _MAX_DEPTH:
-        allowed, hint = "aliases of other entries", "replace the alias by the content that is meant"
-        what = "an alias (*NAME) stands within the entry to which it refers"
-        raise ConfigError(what, where=origin, allowed=allowed, hint=hint)
+        what, hint = "an alias (*NAME) stands within the entry that it repeats", "replace it by the intended content"
+        raise ConfigError(what, where=origin, allowed="aliases of other entries", hint=hint)
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():
@@ -282,8 +281,7 @@ class _Reader:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.options_of_variant(sections.default_variant))
-            what = f"{self._name(path)} is {_shown(raw)}, but must be a section of keys"
-            hint = _key_meant(self._name(path), keys)
+            what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.read_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:

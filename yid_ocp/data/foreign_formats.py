@@ -282,24 +282,18 @@ def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], whe
     found: dict[str, Any] = {}
     require_known_names(paths, JOINT_CHANNEL_UNITS, "joint channel", where, DataError)
     for channel, path in paths.items():
-        value = content
+        value, hint = content, f"choose another field: --field {channel}=/TOPIC.FIELD"
         for part in path.split("."):
             if not hasattr(value, part):
                 known = [name for name in getattr(value, "__dataclass_fields__", {}) if not name.startswith("_")]
                 what = f"the message has no field '{path}'"
-                said = unknown_name_error_arguments(
-                    part, known, f"choose another field: --field {channel}=/TOPIC.FIELD"
-                )
-                raise DataError(what, where=where, **said)
+                raise DataError(what, where=where, **unknown_name_error_arguments(part, known, hint))
             value = getattr(value, part)
         try:
             found[channel] = np.asarray(value, float).ravel()
         except (TypeError, ValueError) as error:
-            allowed, hint = (
-                "an array of numbers, one per joint",
-                f"choose another field: --field {channel}=/TOPIC.FIELD",
-            )
-            raise DataError(f"the field '{path}' is not numeric", where=where, allowed=allowed, hint=hint) from error
+            what, allowed = f"the field '{path}' is not numeric", "an array of numbers, one for each joint"
+            raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return _values([str(i + 1) for i in range(max((len(values) for values in found.values()), default=0))], found)
 
 

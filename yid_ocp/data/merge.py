@@ -115,9 +115,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "because the recording times do not overlap; with this shift the points follow the joint angles best "
-    why += (
-        f"({best.explained:.1%} of the motion). A fit corrects what remains, a shift of about {_ALIGNED_CLOCK_STD:g} s"
-    )
+    why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"
     return begin - start - best.lag, why
 
 

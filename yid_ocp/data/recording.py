@@ -329,15 +329,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
 
     `allow_nan_effort` permits NaN in `effort` and `external_effort`. Errors call the recording `where`, or its name.
-
-    Raises
-    ------
-    DataError
-        There is no group, or a group is empty. Names are repeated or do not match the arrays. A clock is not finite and
-        strictly increasing. A joint value is not finite. A point has an infinite coordinate, or one or two NaN (three
-        NaN: not seen). A standard deviation is negative. The kind of effort is unknown. A pose is not a rigid
-        transform. A joint position exceeds 50 rad or a coordinate 50 m, which indicates degrees or millimetres. A speed
-        or effort is beyond any machine. `marker_reference_pose` does not match the first group of points.
+    Raises `DataError`, also if a position exceeds 50 rad or a coordinate 50 m, which indicates degrees or millimetres,
+    or if a speed or effort is beyond any machine. Three NaN are a point that was not seen; one or two are an error.
     """
     origin = where or f"recording '{recording.name}'"
     allowed, hint = "joints, points or another sensor", "pass joints=JointGroup(...) or points=(PointGroup(...),)"
@@ -346,8 +339,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        what, place = f"the true value of '{key}' is {value!r}, but must be a finite number", f"{origin}: truth"
-        raise_data_error_unless(good, what, place, "numbers such as 0.5", f"write a number, or remove '{key}'")
+        what, hint = f"the true value of '{key}' is {value!r}", f"write a number, or remove '{key}'"
+        raise_data_error_unless(good, what, f"{origin}: truth", "a finite number", hint)
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     for noun, groups in (("points", recording.points), ("sensor channels", recording.channel_groups)):
@@ -356,8 +349,7 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
             raise_data_error_unless(count == 1, what, origin, "every name once", f"rename one of them to {name}_2")
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
-        what = f"a group of points is called '{group.name}', but its name must begin with points"
-        hint = f"rename it, for example to points_{group.name}"
+        what, hint = f"a group of points is called '{group.name}'", f"rename it, for example to points_{group.name}"
         raise_data_error_unless(legal, what, origin, "points, points_<name>", hint)
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
@@ -434,8 +426,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
-        what = f"effort_kind is '{joints.effort_kind}', which is unknown"
-        hint = "write effort_kind = sample, or leave the attribute out if it is not known"
+        what, hint = f"effort_kind is '{joints.effort_kind}', which is unknown", "leave the attribute out if in doubt"
         raise_data_error_unless(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
 
@@ -498,40 +489,32 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
-    what, hint = f"{name} is {std}, which is out of range", f"write a value in this range, or leave {name} out"
-    raise_data_error_unless(good, what, where, f"0 to {_LARGEST_SPREAD:g}", hint)
+    raise_data_error_unless(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", f"leave {name} out if unsure")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
     allowed, hint = "`straight` together with a group of points", "add the group of points, or leave `straight` out"
     raise_data_error_unless(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
-    what, allowed = "`straight` has a position that is not finite", "finite coordinates of every point [m]"
-    hint = "measure all points while the object is straight, or leave `straight` out"
-    raise_data_error_unless(np.isfinite(straight).all(), what, where, allowed, hint)
+    what, hint = "`straight` has a position that is not finite", "measure all points, or leave `straight` out"
+    raise_data_error_unless(np.isfinite(straight).all(), what, where, "finite coordinates of every point [m]", hint)
     _check_distances(straight, where)
     # a file lists its groups by name, so other orders are not stored
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    hint = f"pass '{first.name}' as the first of the point groups, with its own `straight`"
-    raise_data_error_unless(first is groups[0], what, where, "point groups sorted by name", hint)
+    raise_data_error_unless(first is groups[0], what, where, "point groups sorted by name", "sort them by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "a rigid transform")
-    rotation, allowed = pose[:3, :3], "a rotation (3, 3), a translation (3, 1) [m] and the last row 0 0 0 1"
+    rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
     last_is_unit = np.allclose(pose[3], np.eye(4)[3], rtol=0, atol=1e-6)
     orthonormal = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6)
-    reflects = orthonormal and np.linalg.det(rotation) < 0
     for good, what, hint in (
         (np.isfinite(pose).all(), "has a value that is not finite", "write finite numbers, or leave the pose out"),
         (last_is_unit, f"has the last row {pose[3].tolist()}", "transpose the pose, or write 0 0 0 1 as its last row"),
-        (
-            orthonormal,
-            "has axes that are not orthonormal",
-            "write the rotation with 7 digits or more and without a scale",
-        ),
-        (not reflects, "contains a reflection", "reverse the signs of one column of the rotation"),
+        (orthonormal, "has axes that are not orthonormal", "write the rotation with 7 digits and without a scale"),
+        (np.linalg.det(rotation) > 0, "contains a reflection", "reverse the signs of one column of the rotation"),
     ):
         raise_data_error_unless(good, f"the pose {what}", where, allowed, hint)
 
@@ -547,9 +530,8 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         raise_data_error_unless(usable, what, place, allowed, "use letters, digits and underscores, as in left_s0")
         what, hint = f"the name '{name}' occurs {count} times", f"rename all but one, for example to '{name}_2'"
         raise_data_error_unless(count == 1, what, place, "every name once", hint)
-    what, hint = f"the clock is '{group.clock}', which is unknown", "leave clock out if the times were measured"
-    clocks, place = get_args(TimestampKind), f"{where}, attribute clock"
-    raise_data_error_unless(group.clock in clocks, what, place, " or ".join(clocks), hint)
+    clocks, place, hint = get_args(TimestampKind), f"{where}, attribute clock", "leave it out if times were measured"
+    raise_data_error_unless(group.clock in clocks, f"the clock is '{group.clock}'", place, " or ".join(clocks), hint)
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
@@ -564,12 +546,8 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    what, allowed = (
-        f"the array has shape {array.shape}, but must have {shape}",
-        f"{letters}, as in docs/reference/recordings.md",
-    )
-    is_turned = array.shape[::-1] == shape
-    hint = "transpose the array" if is_turned else "check that this array belongs to the `t` and `names` of its group"
+    what, allowed = f"the array has shape {array.shape}, but must have {shape}", f"{letters} (see recordings.md)"
+    hint = "transpose it" if array.shape[::-1] == shape else "write one row for each time and one entry for each name"
     raise_data_error_unless(array.shape == shape, what, where, allowed, hint)
 
 
@@ -578,6 +556,4 @@ def _check_text(where: str, *texts: tuple[str, str]) -> None:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
         what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters and surrogates"
-        raise_data_error_unless(
-            storable, what, f"{where}, attribute {name}", allowed, r"remove \0 and \ud800 to \udfff"
-        )
+        raise_data_error_unless(storable, what, f"{where}, attribute {name}", allowed, "remove these characters")

@@ -127,10 +127,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             straight = _read_dataset(file[name], where, "m")
             continue
         group = file[name]
-        what, hint = (
-            f"'{name}' is a dataset, but must be a group",
-            f"store the values as a dataset in the group '{name}'",
-        )
+        what, hint = f"'{name}' is a dataset, but must be a group", f"store the values as a dataset in '{name}'"
         raise_data_error_unless(isinstance(group, h5py.Group), what, where, "a group with t, position, ...", hint)
         if name == "joints":
             joints = JointGroup(**gain | _read_group(group, where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
@@ -209,8 +206,7 @@ def _text(value: object, where: str) -> str:
         except UnicodeDecodeError as error:
             hint = "write the attribute again as UTF-8"
             raise DataError("the attribute is not UTF-8 text", where=where, allowed="UTF-8 text", hint=hint) from error
-    hint = "write the attribute again as text, such as 'world'"
-    raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text", hint)
+    raise_data_error_unless(isinstance(value, str), f"the value {value} is not text", where, "text", "write it as text")
     return str(value)
 
 
@@ -218,8 +214,7 @@ def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        what, hint = f"the text is not JSON ({error})", "correct the attribute, or delete it"
-        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
+        raise DataError("the text is not JSON", where=where, allowed=allowed, hint="correct or delete it") from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]

@@ -221,9 +221,8 @@ def edge_to_edge_rotations_from_vertices(vertices: ArrayLike, initial_frame: Arr
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        what = f"the vertices have shape {points.shape}, but must have shape (k, 3) with k of 2 or more"
-        allowed, hint = "x, y, z of two or more vertices [m]", "pass vertices=[[0, 0, 0], [0, 0, 0.1]], for example"
-        raise ModelError(what, where="vertices of the polyline", allowed=allowed, hint=hint)
+        what, hint = f"the vertices have the shape {points.shape}", "pass for example [[0, 0, 0], [0, 0, 0.1]]"
+        raise ModelError(what, where="vertices of the polyline", allowed="(k, 3) with k of 2 or more", hint=hint)
     edges = np.diff(points, axis=0)
     if not np.all(np.linalg.norm(edges, axis=1) > 0):
         index = int(np.argmin(np.linalg.norm(edges, axis=1) > 0))
@@ -284,40 +283,27 @@ def _check(segment: FlexibleSegment, known: Mapping[str, SingleSegmentLayout]) -
         raise ModelError(what, where=f"segment {segment.name}", allowed=allowed, hint=hint)
 
     if segment.name in known:
-        what, allowed = f"two segments are called '{segment.name}'", "a name of its own for each segment"
-        refuse(what, allowed, f"rename one of them to '{segment.name}_2'")
+        refuse(f"two segments are called '{segment.name}'", "a name of its own for each", "rename one of them")
     if parent is not None and parent not in known:
         what = f"the parent '{parent}' is not a segment that is listed before segment '{segment.name}'"
-        otherwise = f"list '{parent}' first, or leave parent out if nothing carries the segment"
-        refuse(what, **unknown_name_error_arguments(parent, known, otherwise))
+        refuse(what, **unknown_name_error_arguments(parent, known, f"list '{parent}' first, or leave parent out"))
     if (segment.radius is None) == (section is None):
         found = "both radius and cross_section_size" if section else "neither radius nor cross_section_size"
-        what, hint = (
-            f"the segment has {found}, but must have one",
-            "radius: 0.004, or cross_section_size: [0.001, 0.08]",
-        )
-        refuse(what, "one of the two [m]", f"set only {hint}" if section else f"set {hint}")
+        refuse(f"the segment has {found}", "one of the two", "set radius: 0.004 or cross_section_size: [0.001, 0.08]")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
     for quantity, value in (sizes | {f"cross_section_size[{i}]": size for i, size in enumerate(section or ())}).items():
         if not (math.isfinite(value) and value > 0):
-            unit, example = ("kg", "0.05") if quantity == "mass" else ("m", "0.5" if quantity == "length" else "0.004")
-            what, hint = (
-                f"{quantity} is {value}, but must be above 0",
-                f"set {quantity} to {example} {unit}, for example",
-            )
-            refuse(what, f"a number above 0 [{unit}]", hint)
+            what, unit = f"{quantity} is {value}, but must be above 0", "kg" if quantity == "mass" else "m"
+            refuse(what, f"a number above 0 [{unit}]", f"set {quantity} to 0.05, for example")
     if lengths is None and count < 1:
         refuse(f"links is {count}, but must be 1 or more", "a whole number from 1", "set links: 4, for example")
     if lengths is not None and not min(lengths, default=0.0) > 0:
-        what, hint = (
-            f"link_lengths is {list(lengths)}, but must have only lengths above 0",
-            "set link_lengths: [0.2, 0.3]",
-        )
-        refuse(what, "one or more numbers above 0 [m]", f"{hint}, or length and links for equal links")
+        allowed, hint = "one or more numbers above 0 [m]", "set link_lengths: [0.2, 0.3], or length and links"
+        refuse(f"link_lengths is {list(lengths)}, but must have lengths above 0", allowed, hint)
     if turns is not None and len(turns) != count - 1:
-        what, hint = f"{count} links have {len(turns)} link_rest_rotations", "pass a rotation matrix (3, 3) for each"
-        refuse(f"{what}, but need {count - 1}", f"{count - 1}, one for each link after the first", hint)
+        what, allowed = f"{count} links have {len(turns)} link_rest_rotations, but need {count - 1}", "matrices (3, 3)"
+        refuse(what, allowed, "pass one rotation matrix for each link after the first")
     if at is not None and parent is not None and not 0 <= at < (links := len(known[parent].link_joints)):
         what, allowed = f"parent_link_index is {at}, but '{parent}' has {links} links", f"0 to {links - 1}"
         refuse(what, allowed, f"set parent_link_index: {links - 1}, or leave it out for the last link")

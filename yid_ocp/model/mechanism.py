@@ -170,8 +170,7 @@ class Mechanism(ReprMixin):
         line, _, said = name.partition(":")
         if not self.has_frame(name):
             known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
-            otherwise = f"use the name of a frame, or add the frame: model.frames: {{{name}: {{parent_frame: FRAME}}}}"
-            choice = unknown_name_error_arguments(name, known, otherwise)
+            choice = unknown_name_error_arguments(name, known, "use one of these frames, or add one to model.frames")
             raise ModelError(f"there is no frame '{name}'", where=f"model '{self.name}'", **choice)
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
@@ -220,9 +219,8 @@ class Mechanism(ReprMixin):
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
         """Return a copy with a new frame `name` at a fixed pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
-            what, where = f"there is already a frame '{name}'", f"model '{self.name}'"
-            allowed, hint = "a name that no frame has", f"call the added frame '{name}_2', for example"
-            raise ModelError(what, where=where, allowed=allowed, hint=hint)
+            what, hint = f"there is already a frame '{name}'", f"call the added frame '{name}_2', for example"
+            raise ModelError(what, where=f"model '{self.name}'", allowed="a name that no frame has", hint=hint)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
         added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})

@@ -112,14 +112,9 @@ def _body(
     for j in range(first, first + count):
         label, kind = _joint_name(model, j), _JOINT_TYPE_NAMES.get(int(model.jnt_type[j]))
         if kind is None:
-            kind, hint = "free", f"delete the free joint '{label}', so that its body is fixed"
-            if model.jnt_type[j]:
-                kind, hint = "ball", "replace the ball by three hinges with the axes x, y and z"
-            what, allowed = (
-                f"joint '{label}' has the type {kind}, which is not modelled",
-                "joints of type hinge or slide",
-            )
-            raise ModelError(what, where=where, allowed=allowed, hint=hint)
+            what = f"joint '{label}' has the type {'ball' if model.jnt_type[j] else 'free'}, which is not modelled"
+            hint = "replace a ball joint by three hinges; delete a free joint, so that its body is fixed"
+            raise ModelError(what, where=where, allowed="hinge, slide", hint=hint)
         place, axis, ref = model.jnt_pos[j], model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         origin = at @ _shift(place - last) @ joint_displacement_transform(axis, -ref, kind)
         carried = name if j == first + count - 1 and not np.any(place) else f"{label}_link"

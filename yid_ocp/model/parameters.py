@@ -32,8 +32,7 @@ class Parameter:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
             what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
-            hint = f"pass a finite value, or set parameters.{self.name}.initial: 1.0, for example"
-            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint=hint)
+            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint="pass value=1.0, for example")
         if not self.lower <= self.value <= self.upper:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
@@ -90,9 +89,8 @@ class Parameters(ReprMixin):
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):
-                what, allowed = f"{name} = {value} is not a finite number", "a finite number"
-                hint = f"pass a finite value, such as the nominal {name}={self[name].value:g}"
-                raise ConfigError(what, where=f"parameter {name}", allowed=allowed, hint=hint)
+                what, hint = f"{name} = {value} is not a finite number", f"pass for example {self[name].value:g}"
+                raise ConfigError(what, where=f"parameter {name}", allowed="a finite number", hint=hint)
             theta[self.index(name)] = value
         return theta
 

@@ -97,8 +97,7 @@ class MotorKindAndPreset:
         if self.preset is not None and self.kind != "dc":
             what = f"the preset '{self.preset}' is for a dc motor, but the motor has kind: {self.kind}"
             hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
-            allowed = "a preset with kind: dc, or no preset"
-            raise ConfigError(what, where="model.arms.servo.motor.preset", allowed=allowed, hint=hint)
+            raise ConfigError(what, where="model.arms.servo.motor.preset", allowed="preset with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)

@@ -284,10 +284,7 @@ class System(ReprMixin):
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
-            what, hint = (
-                f"gravity is {gravity.tolist()}, but must be 3 finite numbers",
-                "pass gravity=(0.0, 0.0, -9.81)",
-            )
+            what, hint = f"gravity is {gravity.tolist()}, but must be 3 finite numbers", "pass (0.0, 0.0, -9.81)"
             raise ModelError(what, where="gravity", allowed="x, y, z in the world frame [m/s^2]", hint=hint)
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
@@ -471,9 +468,8 @@ def _check_names(
             what, allowed = f"'{repeated[0]}' is listed twice among the {kind}", "each name once"
             raise ModelError(what, where=kind, allowed=allowed, hint=f"delete one '{repeated[0]}' from the list")
     if both := sorted(set(driven) & set(prescribed)):
-        what, where = f"joint '{both[0]}' is both driven and prescribed", "driven and prescribed joints"
-        hint = f"leave '{both[0]}' out of one of the two lists"
-        raise ModelError(what, where=where, allowed="each joint in one of the two lists", hint=hint)
+        what, hint = f"joint '{both[0]}' is both driven and prescribed", f"leave '{both[0]}' out of one of the lists"
+        raise ModelError(what, where="driven and prescribed joints", allowed="one of the two", hint=hint)
     for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
         tree.frame(frame)
 

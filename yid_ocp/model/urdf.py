@@ -274,9 +274,7 @@ def _part(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
     if any("xacro}" in part.tag for part in robot.iter()):
         hint = f"expand the macros by `xacro {where} > robot.urdf`, and use robot.urdf"
-        raise ModelError(
-            "the file has xacro macros that are not expanded", where=where, allowed="URDF without macros", hint=hint
-        )
+        raise ModelError("the file has unexpanded xacro macros", where=where, allowed="URDF without macros", hint=hint)
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue
@@ -341,8 +339,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
             raise ModelError(what, where=where, allowed="joints without <mimic>", hint=hint)
         if mimic.joint not in joints:
             what = f"joint '{name}' follows (mimic) a joint '{mimic.joint}' that does not exist"
-            otherwise = f"name an existing joint in the <mimic> of '{name}', or delete it"
-            raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints, otherwise))
+            raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints))
         if name in locked:
             continue
         if wanted is None or mimic.joint in wanted:
@@ -356,13 +353,11 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
     """Name of the root link, after a check of all joints and links and of the names of wanted joints."""
     for joint in robot.joints:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
-            what = f"joint '{joint.name}' has the type '{joint.type}', which is not modelled"
-            hint = "set its type to fixed, or replace it by several joints of the allowed types"
+            what, hint = f"joint '{joint.name}' has the unknown type '{joint.type}'", "set type fixed, for example"
             raise ModelError(what, where=where, allowed="revolute, continuous, prismatic, fixed", hint=hint)
         if joint.type in _MOVABLE_JOINT_TYPES and np.linalg.norm(joint.axis) < 1e-9:
-            what, allowed = f"the axis of joint '{joint.name}' is 0 0 0", "an axis other than 0 0 0"
-            hint = 'write the axis, such as <axis xyz="0 0 1"/>, or set the type of the joint to fixed'
-            raise ModelError(what, where=where, allowed=allowed, hint=hint)
+            what, hint = f"the axis of joint '{joint.name}' is 0 0 0", "write for example 0 0 1, or set type fixed"
+            raise ModelError(what, where=where, allowed="an axis other than 0 0 0", hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
     require_known_names(wanted, known, "movable joint", where, ModelError)
     names, below = [link.name for link in robot.links], [joint.child for joint in robot.joints]
@@ -370,8 +365,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
         for link in (joint.parent, joint.child):
             if link not in names:
                 what = f"joint '{joint.name}' connects a link '{link}' that does not exist"
-                said = unknown_name_error_arguments(str(link), names, f'add <link name="{link}"/> to the URDF')
-                raise ModelError(what, where=where, **said)
+                raise ModelError(what, where=where, **unknown_name_error_arguments(str(link), names))
     roots = [name for name in dict.fromkeys(names) if name not in below]
     if len(roots) != 1:
         what = f"the URDF has {len(roots)} root links" + (f": {', '.join(map(str, roots[:4]))}" if roots else "")
@@ -417,8 +411,7 @@ def _walk(
                 stack.append((joint.child, carrier, at @ joint.origin @ motion, link))
     if loose := sorted(set(links) - set(frames) - dropped):
         what = f"link '{loose[0]}' is not connected to the root link '{root}'"
-        hint = f"add a joint of type fixed whose child is '{loose[0]}', or delete the link"
-        raise ModelError(what, where=where, allowed="one tree of links", hint=hint)
+        raise ModelError(what, where=where, allowed="one tree of links", hint="connect it by a joint, or delete it")
     return joints, bodies, frames
 
 

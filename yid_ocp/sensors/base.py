@@ -179,8 +179,7 @@ class _RecordingData(Protocol):
 def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
     """Return the error for a channel whose noise standard deviation is neither recorded nor in the settings."""
     what = f"the standard deviation of the noise of {noun} is neither recorded nor in the settings"
-    hint = f"set sensors.{key}.std: NUMBER, in {unit}"
-    return DataError(what, where=where, allowed=f"a standard deviation above 0 [{unit}]", hint=hint)
+    return DataError(what, where=where, allowed=f"a number above 0 [{unit}]", hint=f"set sensors.{key}.std: NUMBER")
 
 
 def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[str, ...], where: str) -> list[int]:
@@ -188,8 +187,7 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
     for name in names:
         if name not in joints.names:
             what = f"joint '{name}' of the model is not recorded"
-            otherwise = f"record '{name}' as well, or leave it out of model.arms.joints"
-            said = unknown_name_error_arguments(name, joints.names, otherwise)
+            said = unknown_name_error_arguments(name, joints.names, "record it, or leave it out of model.arms.joints")
             raise DataError(what, where=f"recording '{where}': joints", **said)
     return [joints.names.index(name) for name in names]
 
@@ -201,9 +199,8 @@ def expand_to_joint_values(
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
-                what, hint = f"'{name}' has no value, but others have one", f"add {name}: NUMBER to {key}"
-                allowed = f"one number for all, or one for each of {', '.join(names)}"
-                raise ConfigError(what, where=key, allowed=allowed, hint=hint)
+                allowed, hint = f"a value for each of {', '.join(names)}", f"add {name}: NUMBER to {key}"
+                raise ConfigError(f"'{name}' has no value", where=key, allowed=allowed, hint=hint)
         return np.array([float(given[name]) for name in names])
     wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
     return wide[[list(recorded).index(name) for name in names]]

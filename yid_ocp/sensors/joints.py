@@ -103,7 +103,7 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
         return []
     if arm:
         both = f"the encoders and the points '{arm[0]}' on the arm are both used"
-        what = f"{both}, but the points are computed from the encoders and are no further measurements"
+        what = f"{both}, but the points are computed from the encoders"
         allowed, hint = "encoders or points", f"set sensors.{arm[0]}.use: false, or sensors.joints.position.use: false"
         raise ConfigError(what, where="sensors.joints.position.use", allowed=allowed, hint=hint)
     where = around.recording.name
@@ -142,9 +142,8 @@ def filtered_effort_sensor_data(
     time. Raises `DataError` if the recording is too short for the filter.
     """
     # the mean of an interval belongs to its centre
-    kept, measured = decorrelated_nodes_and_low_pass_values(
-        inputs, t, values, sensor.group_name, at_centres=not is_sample
-    )
+    name, centres = sensor.group_name, not is_sample
+    kept, measured = decorrelated_nodes_and_low_pass_values(inputs, t, values, name, at_centres=centres)
     measured[_may_stick(inputs, sensor.joint_names, inputs.node_times[kept])] = np.nan
     times, last = inputs.node_times[kept], len(inputs.node_times) - 1
     unit, period = sensor.effort_per_unit_reading, float(np.median(np.diff(t)))
@@ -247,9 +246,8 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
     """Noise std (k,) of channels (N, k) by high-order differences. Changes as fast as the sampling count as noise."""
     order = NOISE_ESTIMATE_DIFFERENCE_ORDER
     if len(values) <= order:
-        what = f"{len(values)} samples are too few to estimate the noise of {group}"
-        allowed, hint = f"{order + 1} samples or more", f"set sensors.{group}.std: NUMBER, in {unit}"
-        raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=hint)
+        what, allowed = f"{len(values)} samples are too few to estimate the noise of {group}", f"{order + 1} or more"
+        raise DataError(what, where=f"recording '{where}'", allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
     mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
     return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
 

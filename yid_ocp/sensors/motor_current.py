@@ -52,10 +52,9 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
     if choice.use is False or not names or around.recording.joints is None:
         return None
     for name in group.names:
-        if name not in around.system.mechanism.joint_names:
-            otherwise = f"correct the name in the recording, or set sensors.{key}.use: false"
-            said = unknown_name_error_arguments(name, around.system.mechanism.joint_names, otherwise)
-            raise DataError(f"currents are recorded for '{name}', which is no joint of the model", where=where, **said)
+        if name not in (known := around.system.mechanism.joint_names):
+            said = unknown_name_error_arguments(name, known, f"set sensors.{key}.use: false")
+            raise DataError(f"the model has no joint '{name}', whose current is recorded", where=where, **said)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
@@ -71,7 +70,7 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
     ]
     if not np.all(by_joint[0] != 0):
         what = f"the torque constant of joint '{names[int(np.argmin(np.abs(by_joint[0])))]}' is zero"
-        where, hint = f"sensors.{key}.constants", f"set its {_TORQUE_CONSTANT} to the torque per current of the motor"
+        where, hint = f"sensors.{key}.constants", f"set {_TORQUE_CONSTANT} to the motor's torque per current"
         raise DataError(what, where=where, allowed="numbers other than zero [N m/A]", hint=hint)
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]

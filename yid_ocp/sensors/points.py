@@ -58,8 +58,8 @@ def _points(
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
             what = f"the point '{point}' belongs to the frame '{frames[point]}', which the model does not have"
-            otherwise = f"set sensors.{group.name}.frame_by_recorded_name: {{{point}: FRAME}} to a frame of the model"
-            said = unknown_name_error_arguments(frames[point], mechanism.frames, otherwise)
+            hint = f"set frame_by_recorded_name: {{{point}: FRAME}}"
+            said = unknown_name_error_arguments(frames[point], mechanism.frames, hint)
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
         what = f"none of the recorded points {', '.join(wanted)} has the name of a frame of the model"
@@ -72,8 +72,7 @@ def _points(
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
     if isinstance(choice.std, Mapping):
-        what = "the setting has a number for each of several points, but must be one number for the whole group"
-        hint = f"set sensors.{group.name}.std: {next(iter(choice.std.values()), 0.001):g}, for example"
+        what, hint = "a point group has one standard deviation for all points, but several are set", "set one number"
         raise ConfigError(what, where=f"sensors.{group.name}.std", allowed="one number above 0 [m]", hint=hint)
     if choice.std is not None:
         std = np.full(value.shape, float(choice.std))

@@ -40,9 +40,8 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     default = parameters["options"].default if "options" in parameters else None
     for name in options:
         if name not in known:
-            what = f"the reader of '{known_as}' files has no option '{name}'"
-            said = unknown_name_error_arguments(name, known, f"leave the option '{name}' out")
-            raise DataError(what, where=str(path), **said)
+            what, hint = f"the reader of '{known_as}' files has no option '{name}'", f"leave the option '{name}' out"
+            raise DataError(what, where=str(path), **unknown_name_error_arguments(name, known, hint))
     given = {"options": replace(default, **options)} if default else options
     return reader(path, **given, **_told(reader, progress))
 
@@ -82,7 +81,6 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        otherwise = "export the data as CSV, with the columns t, q_JOINT, effort_JOINT, POINT_x, ..."
-        known = unknown_name_error_arguments(key, READERS, otherwise)
-        raise DataError(f"there is no reader for '{key}' files", where=str(path), **known)
+        what, hint = f"there is no reader for '{key}' files", "export the data as CSV with the columns t, q_JOINT, ..."
+        raise DataError(what, where=str(path), **unknown_name_error_arguments(key, READERS, hint))
     return key

@@ -112,9 +112,7 @@ class OpenBag:
             what, otherwise = f"the bag has no {noun} on the topic '{name}'", "choose a topic that `--preview` lists"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known, otherwise))
 
-    def no_usable_topics_error(
-        self, what: str, allowed: str, hint: str = "record such a topic too, or use the bag that has it"
-    ) -> DataError:
+    def no_usable_topics_error(self, what: str, allowed: str, hint: str = "use the bag that has it") -> DataError:
         """Return the `DataError` for a bag without usable topics. Its text lists the topics of the bag."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "none"
         return DataError(what, where=f"{self.path}, topics: {held}", allowed=allowed, hint=hint)
@@ -187,25 +185,22 @@ def _read_bag(
     path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
     if distance is not None and not 0 < distance < float("inf"):
-        what, allowed = f"pose_axis_point_distance is {distance:g} m, but must be above 0", "a finite distance [m]"
-        where, hint = f"--pose-axis-point-distance, for {path}", "use for example --pose-axis-point-distance 0.1"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        what, option = f"pose_axis_point_distance is {distance:g} m, but must be above 0", "--pose-axis-point-distance"
+        raise DataError(what, where=f"{option}, for {path}", allowed="a finite distance [m]", hint=f"add {option} 0.1")
     bag = _contents(path, tuple(at for at in options.point_names or () if ":" in at), progress, options.message_fields)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.point_names, str(path))
     if not groups and not seen and not bag.mounted:
         kinds = ", ".join((*_KNOWN, _TREES[0]))
         allowed = f"topics of the types {kinds}, or fields of any: --field position=/TOPIC.FIELD"
-        what = "the bag has no topic with joint states, points or another known measurement"
-        hint = "record such topics, or name the array of joint positions: --field position=/TOPIC.FIELD"
+        what, hint = "the bag has no joint states and no points", "name the angles: --field position=/TOPIC.FIELD"
         raise bag.file.no_usable_topics_error(what, allowed, hint)
     places = [message for entries in seen.values() for _, message in entries]
     used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
     seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     if unstamped := sum(message.stamp <= 0 for message in used_messages):
-        said = f"{unstamped} of {len(used_messages)} messages have no stamp"
-        more = (*more, f"{said}, so the times of all messages are those at which the bag recorded them")
+        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp, so times of recording are used")
     points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))
@@ -221,8 +216,7 @@ def _read_bag(
     if turned and distance is None:
         said = f"the orientations of {', '.join(sorted(turned))} were left out"
         more = (*more, f"{said}. To keep them as points, add --pose-axis-point-distance 0.1")
-    said = ((t.name, f"{t.kind}, {t.n_messages} messages") for t in bag.file.topics if t.name not in used)
-    left = [f"{name} was left out ({content})" for name, content in said]
+    left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
@@ -245,9 +239,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     elif len(states) > 1:
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
-        notes.append(
-            "poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along the axes"
-        )
+        notes.append("poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
     units, why = base.guess_non_si_units(_for_guess(bag))
     options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
@@ -306,15 +298,11 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
         if not path:
-            what, hint = (
-                f"'{channel}={topic}' names a topic, but no field of it",
-                f"write --field {channel}={topic}.FIELD",
-            )
+            what, hint = f"'{channel}={topic}' names a topic, but no field", f"write --field {channel}={topic}.FIELD"
             raise DataError(what, where=where, allowed=allowed, hint=hint)
     if len(topics) > 1 or (fields and "position" not in fields):
-        what, hint = "the channel position has no field", f"add --field position={topics[0]}.FIELD"
-        if len(topics) > 1:
-            what, hint = f"the fields belong to several topics: {', '.join(topics)}", f"use fields of {topics[0]} only"
+        what = f"the fields belong to {len(topics)} topics" if len(topics) > 1 else "the channel position has no field"
+        hint = "choose fields of one topic" if len(topics) > 1 else f"add --field position={topics[0]}.FIELD"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return next(iter(topics), ""), {channel: path for channel, (_, _, path) in split.items()}
 
@@ -417,15 +405,13 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         messages = [message for message in bag.states if message.source == topic]
         sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
         if wanted is None and len(sets) > 1:
-            what = f"the messages of {topic} have {len(sets)} different sets of joints"
-            allowed = "joints of one of the sets " + "; ".join(", ".join(names) for names in sets.values())
-            hint = f"choose joints of one set: --joints {','.join(next(iter(sets.values())))}"
-            raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=hint)
+            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints of one set"
+            allowed = "one of the sets: " + "; ".join(", ".join(names) for names in sets.values())
+            raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=f"{hint}: --joints NAME,NAME")
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
-        if len(kept) < len(messages) and names:
-            said = f"{len(messages) - len(kept)} of {len(messages)} messages of {topic}"
-            notes.append(f"{said} were left out, because they lack a joint")
+        if (skipped := len(messages) - len(kept)) and names:
+            notes.append(f"{skipped} of {len(messages)} messages of {topic} were skipped, because they lack a joint")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
             found.append(_States(topic, names, renamed, kept))
@@ -435,8 +421,7 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
             allowed, hint = f"messages with {', '.join(names) or 'the joints'}", "choose another --command-topic TOPIC"
-            what = f"no message of '{command}' has commands for all joints"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(f"no message of '{command}' has all joints", where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 
@@ -456,9 +441,8 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
             raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
-        what, allowed = "no message has all the chosen joints", f"joints of one of the sets {allowed}"
-        hint = f"choose joints of one set: --joints {','.join(next(iter(sets), ()))}"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        what, allowed = "no message has all the chosen joints", f"joints of one of these sets: {allowed}"
+        raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
 
 
 def _on_one_clock(
@@ -467,8 +451,7 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    hint = f"choose topics that belong together: --joint-topic {groups[0].topic}"
-    together, notes = base.joints_on_fastest_clock(made, where, hint)
+    together, notes = base.joints_on_fastest_clock(made, where, f"choose topics: --joint-topic {groups[0].topic},...")
     for entry in (entry for entry in groups if entry.command):
         group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
         # each command is held until the next; before the first command, the first one is used

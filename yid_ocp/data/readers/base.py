@@ -97,13 +97,11 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
             what = f"a unit is given for '{quantity}', which is not the name of a quantity"
-            said = unknown_name_error_arguments(quantity, _QUANTITIES, f"write for example --units position={unit}")
-            raise DataError(what, where=f"--units, for {where}", **said)
+            raise DataError(what, where=f"--units, for {where}", **unknown_name_error_arguments(quantity, _QUANTITIES))
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
-            said = unknown_name_error_arguments(unit, names, f"write for example --units {quantity}={names[-1]}")
-            raise DataError(what, where=where, **said)
+            raise DataError(what, where=where, **unknown_name_error_arguments(unit, names))
         factors[quantity] = known[_spaceless(unit)]
     return factors
 
@@ -194,12 +192,10 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
                 what = f"{word} has a value for '{pattern}', but no joint has this name"
-                said = unknown_name_error_arguments(pattern, names, f"leave '{pattern}' out, or write * for all joints")
-                raise DataError(what, where=where, **said)
+                raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
             if not (math.isfinite(value) and value != 0):
                 what, allowed = f"{word} of '{pattern}' is {value:g}", "a finite number that is not zero"
-                hint = f"write for example --{word.replace('_', '-')} {pattern}=0.1"
-                raise DataError(what, where=where, allowed=allowed, hint=hint)
+                raise DataError(what, where=where, allowed=allowed, hint=f"write for example {pattern}=0.1")
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
             what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"

@@ -14,7 +14,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.data.recording import PointGroup, Recording, raise_data_error_unless
 from yid_ocp.data.recording_hdf5 import check_readable_in_child_process
 from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import file_sha256
@@ -76,11 +76,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
         seen = np.isfinite(found.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
-    notes = (
-        [f"the file states the unit {found.unit}"]
-        if found.unit
-        else ["the file states no unit. Its lengths are taken to be in metres; if they are in mm, add --units mm"]
-    )
+    notes = [f"the file states the unit {found.unit}" if found.unit else "no unit is stated; for mm, add --units mm"]
     return base.FilePreview((*sources, *found.others), {"point_names": {n: n for n in found.names}}, tuple(notes))
 
 
@@ -99,13 +95,11 @@ def _markers(path: Path) -> _Markers:
         computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise _unreadable(path) from error
-    if not rate > 0 or not len(position) or not labels:
-        what = "the C3D file has no labelled markers" if not labels else "the C3D file has no frames or no frame rate"
-        hint = "label the markers in the capture program, and export the file again with their trajectories"
-        raise DataError(what, where=str(path), allowed="labelled 3-D points and their frame rate", hint=hint)
-    if unit and unit not in _LENGTH_UNITS:
-        what, hint = f"the unit of the markers is '{unit}', which is unknown", "export the file again in mm"
-        raise DataError(what, where=str(path), allowed=", ".join(_LENGTH_UNITS), hint=hint)
+    what = "the C3D file has no frames or no frame rate" if labels else "the C3D file has no labelled markers"
+    allowed, hint = "labelled 3-D points and their frame rate", "label the markers, and export their trajectories again"
+    raise_data_error_unless(rate > 0 and len(position) and labels, what, str(path), allowed, hint)
+    what, known = f"the unit of the markers is '{unit}', which is unknown", ", ".join(_LENGTH_UNITS)
+    raise_data_error_unless(unit in ("", *_LENGTH_UNITS), what, str(path), known, "export the file again in mm")
     position = position[:, : len(labels)]
     unseen = (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
     position[unseen] = np.nan
@@ -116,10 +110,8 @@ def _markers(path: Path) -> _Markers:
         if reason or unseen[:, i].all():
             why[i] = reason or "never seen"
     kept = [i for i in range(len(labels)) if i not in why]
-    if not kept:
-        left = ", ".join(f"{n} {r}" for r, n in Counter(why.values()).items())
-        what = f"the C3D file has no usable marker ({left})"
-        raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label markers, and export again")
+    what = "the C3D file has no usable marker: " + ", ".join(f"{n} {r}" for r, n in Counter(why.values()).items())
+    raise_data_error_unless(kept, what, str(path), "labelled 3-D points", "label the markers, and export again")
     others = []
     for i, reason in why.items():
         name, count = labels[i] or f"marker {i + 1}", int(np.sum(~unseen[:, i]))

@@ -27,6 +27,7 @@ from yid_ocp.data.recording import (
     Recording,
     SensorChannelGroup,
     TimestampKind,
+    raise_data_error_unless,
 )
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, os_error_reason
@@ -83,10 +84,9 @@ def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) ->
     path = Path(path)
     said = options.description, path.name, path.stem, file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
-        if options.column_meanings:
-            what = "--columns is given, but the file is a motion capture export, whose header gives the meanings"
-            allowed, hint = "no --columns", "leave --columns out, and choose markers by --points MARKER=POINT"
-            raise DataError(what, where=str(path), allowed=allowed, hint=hint)
+        what = "--columns is given, but the file is a motion capture export, whose header gives the meanings"
+        allowed, hint = "no --columns", "leave --columns out, and choose markers by --points MARKER=POINT"
+        raise_data_error_unless(not options.column_meanings, what, str(path), allowed, hint)
         seen, unit, remarks = capture
         sensor = seen.sensor_name if options.point_sensor_name == "unknown" else options.point_sensor_name
         group = replace(seen, sensor_name=sensor, frame=options.point_frame)
@@ -194,9 +194,8 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         _numbers(head[1], names, [None] * len(names), f"{path}, line {head[0]}")
     table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
-    if not numeric.any():
-        hint = "set the character between its columns, such as --delimiter ';' (--preview shows the columns)"
-        raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
+    hint = "set the character between its columns, such as --delimiter ';' (--preview shows the columns)"
+    raise_data_error_unless(numeric.any(), "the table has no column of numbers", str(path), _ALLOWED, hint)
     text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
@@ -242,9 +241,8 @@ _OR_SKIP = ", or skip such lines with --skip-bad-lines"
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every nonempty line."""
-    if len(delimiter) != 1:
-        what, hint = f"the delimiter is {delimiter!r}, but must be one character", "set for example --delimiter ';'"
-        raise DataError(what, where=str(path), allowed="one character, such as , ; or tab", hint=hint)
+    what, hint = f"the delimiter is {delimiter!r}, but must be one character", "set for example --delimiter ';'"
+    raise_data_error_unless(len(delimiter) == 1, what, str(path), "one character, such as , ; or tab", hint)
     try:
         with check_input_file(path).open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
@@ -308,9 +306,8 @@ def _read_table(
                 raise
             bad.append(line)
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
-    if not len(table):
-        allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
-        raise DataError("the table has no rows below its header", where=str(path), allowed=allowed, hint=hint)
+    allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
+    raise_data_error_unless(len(table), "the table has no rows below its header", str(path), allowed, hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:
         what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers"
@@ -325,21 +322,17 @@ def _read_table(
 
 
 def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> None:
-    if not any(header):
-        hint = "export the measurements again, with a header and rows"
-        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED, hint=hint)
-    if options.has_header and all(_is_number(cell) for cell in header):
-        hint = "add --no-header --columns t,position:JOINT,... with a meaning (or skip) for every column"
-        raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
-    if len(header) == 1:
-        others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
-        hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
-        what = f"the table has only one column, '{header[0]}'"
-        raise DataError(what, where=str(path), allowed=_ALLOWED, hint=hint)
-    name, count = Counter(header).most_common(1)[0]
-    if options.has_header and count > 1:
-        allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
-        raise DataError(f"two columns are called '{name}'", where=f"{path}, line 1", allowed=allowed, hint=hint)
+    what, where = "the table is empty", f"{path}, line 1"
+    raise_data_error_unless(any(header), what, str(path), _ALLOWED, "export the measurements again")
+    is_lost = options.has_header and all(_is_number(cell) for cell in header)
+    hint = "add --no-header --columns t,position:JOINT,... with a meaning (or skip) for every column"
+    raise_data_error_unless(not is_lost, "the table has no header row", where, _ALLOWED, hint)
+    others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
+    hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
+    raise_data_error_unless(len(header) > 1, f"the table has one column, '{header[0]}'", str(path), _ALLOWED, hint)
+    name, count = Counter(header).most_common(1)[0] if options.has_header else ("", 1)
+    allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
+    raise_data_error_unless(count == 1, f"two columns are called '{name}'", where, allowed, hint)
 
 
 def _is_number(cell: str) -> bool:
@@ -367,8 +360,7 @@ def _parsed_number(cell: str) -> float:
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        what = f"the row has {len(cells)} cells, but the header has {len(header)}"
-        allowed = f"{len(header)} cells in every row"
+        what, allowed = f"the row has {len(cells)} cells, but the header has {len(header)}", "as many as the header"
         hint = f"correct the row{_OR_SKIP}"
         if len(cells) > len(header):
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
@@ -376,8 +368,7 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
     values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
     if any("," in cell for cell in values) and any("." in cell for cell in values):
         what, allowed = "the row has numbers with commas and numbers with points", "decimal commas or decimal points"
-        hint = f"export the table again with decimal points and without thousands separators{_OR_SKIP}"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        raise DataError(what, where=where, allowed=allowed, hint=f"export it without thousands separators{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
         if meaning:
@@ -404,8 +395,7 @@ def _meanings(
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
-            said = unknown_name_error_arguments(key, header, f"leave '{key}' out of --columns")
-            raise DataError(f"there is no column '{key}'", where=where, **said)
+            raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: dict[str, ColumnMeaning] = {}
@@ -432,9 +422,8 @@ def _meanings(
             raise DataError(what, where=where, allowed="one column for every meaning", hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
-        names = [name for name in header if name]
-        what = f"the table has no column of times; its columns are {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
-        hint = f"name the column of times, for example --columns '{names[0]}=t'"
+        what = f"the table has no column of times; its columns are {', '.join(header)}"
+        hint = f"name the column of times, for example --columns '{next(filter(None, header))}=t'"
         raise DataError(what, where=where, allowed="a column named t or time, in seconds", hint=hint)
     return list(meanings.values()), units
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.data.recording import JointGroup, Recording, raise_data_error_unless
 from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, read_input_json
 
@@ -148,10 +148,8 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     what = f"the unit of the joint positions is unknown; the largest absolute value is {widest:.3g}{of}"
     allowed, hint = "--units deg" if of else "--units deg, or --units position=rad", "add --units deg"
     if widest <= _MAX_NORMALISED:
-        hint = (
-            "add --units deg only if the robot was recorded with use_degrees=true. If not, the values are normalised "
-        )
-        hint += "(-100 to 100) and cannot be converted, so record again with use_degrees=true"
+        hint = "add --units deg only if the robot was recorded with use_degrees=true. If not, the values are from -100 "
+        hint += "to 100 of the range and cannot be converted, so record again with use_degrees=true"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -168,14 +166,11 @@ def _dataset(folder: Path) -> _Dataset:
         what = f"{key or 'the content'} is {json.dumps(wrong['input'])[:60]}, which is not allowed"
         what = f"the key '{key}' is missing" if wrong["type"] == "missing" else what
         raise DataError(what, where=f"{where}: {key}" if key else where, allowed=allowed, hint=hint) from error
-    version = info.codebase_version
-    if version not in _VERSIONS:
-        what = f"the dataset has the version {version}, which cannot be read"
-        raise DataError(what, where=f"{where}: codebase_version", allowed=", ".join(_VERSIONS), hint=hint)
-    if _STATE not in info.features:
-        what, allowed = f"the dataset has no {_STATE}, the measured joint positions", f"features with {_STATE}"
-        hint = "record the dataset again with the state of the robot"
-        raise DataError(what, where=f"{where}: features", allowed=allowed, hint=hint)
+    version, place = info.codebase_version, f"{where}: codebase_version"
+    what = f"the dataset has the version {version}, which cannot be read"
+    raise_data_error_unless(version in _VERSIONS, what, place, ", ".join(_VERSIONS), hint)
+    what, hint = f"the dataset has no {_STATE} (measured joint positions)", "record it with the state of the robot"
+    raise_data_error_unless(_STATE in info.features, what, f"{where}: features", f"features with {_STATE}", hint)
     return _Dataset(folder, info)
 
 
@@ -186,9 +181,8 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
     where = f"{dataset.folder}, episode {episode}"
     last = dataset.info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
-    if episode < 0 or (last >= 0 and episode > last):
-        hint = f"choose a recorded episode, such as --episode {max(last, 0)}"
-        raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed, hint=hint)
+    is_known, hint = episode >= 0 and (last < 0 or episode <= last), f"choose for example --episode {max(last, 0)}"
+    raise_data_error_unless(is_known, f"there is no episode {episode}", str(dataset.folder), allowed, hint)
     wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
     columns = [*wanted, "frame_index", "episode_index"]
     for file in _files(dataset, episode):
@@ -204,10 +198,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             raise DataError(what, where=str(file), allowed=allowed, hint=hint) from error
         if len(found["frame_index"]):
             return found, file
-    what, hint = (
-        f"no file of the dataset has episode {episode}",
-        "download the whole dataset, or choose another episode",
-    )
+    what, hint = f"no file of the dataset has episode {episode}", "download the whole dataset, with all episodes"
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -240,16 +231,18 @@ def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
 
 def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
     """Raise `DataError` if a column of a parquet file contains anything except numbers or lists of numbers."""
-    from pyarrow import types
+    from pyarrow.types import is_floating, is_integer
 
     for name in columns:
         kind = schema.field(name).type
         while hasattr(kind, "value_field"):
             kind = kind.value_type
-        if not (types.is_integer(kind) or types.is_floating(kind)):
-            what = f"the column {name} contains {kind} instead of numbers"
-            hint = f"convert or record the dataset again, with numbers in {name}"
-            raise DataError(what, where=where, allowed="numbers, or lists of numbers", hint=hint)
+        what, is_numeric = (
+            f"the column {name} contains {kind} instead of numbers",
+            is_integer(kind) or is_floating(kind),
+        )
+        hint = f"convert or record the dataset again, with numbers in {name}"
+        raise_data_error_unless(is_numeric, what, where, "numbers, or lists of numbers", hint)
 
 
 def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
@@ -264,10 +257,9 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
     channels: dict[str, Any] = {}
     for channel in dict.fromkeys(channel for _, channel in entries):
         at = [entries.index((joint, channel)) for joint in joints if (joint, channel) in entries]
-        if len(at) < len(joints):
-            what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints"
-            allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
-            raise DataError(what, where=f"{dataset.folder}: {_STATE}", allowed=allowed, hint=hint)
+        what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints"
+        allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
+        raise_data_error_unless(len(at) == len(joints), what, f"{dataset.folder}: {_STATE}", allowed, hint)
         channels[channel] = state[:, at]
     left = {}
     for name in dataset.info.features:
@@ -293,10 +285,9 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
     while hasattr(column.type, "value_field"):
         n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
         column = column.flatten()
-    if n_lengths > 1 or len(column) < rows:
-        what, allowed = f"the lists of column '{name}' differ in length", "lists of equal length in all frames"
-        hint = f"remove the frames in which {name} has another length, or convert the dataset again"
-        raise DataError(what, where=str(folder), allowed=allowed, hint=hint)
+    what, allowed = f"the lists of column '{name}' differ in length", "lists of equal length in all frames"
+    hint = f"remove the frames in which {name} has another length, or convert the dataset again"
+    raise_data_error_unless(n_lengths == 1 and len(column) >= rows, what, str(folder), allowed, hint)
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 

@@ -73,14 +73,9 @@ class CableVertices:
             raise ModelError(what, where="cable: main_branch_vertex_names", allowed=allowed, hint=hint)
         for name, vertices in self.child_branch_vertex_names.items():
             if len(vertices) < 2 or vertices[0] not in free:
-                is_short, where = len(vertices) < 2, f"cable: child_branch_vertex_names.{name}"
-                why = (
-                    f"has {len(vertices)} vertices"
-                    if is_short
-                    else f"starts at '{vertices[0]}', not on the main branch"
-                )
+                why = f"begins at '{vertices[0]}', not on the main branch" if vertices[1:] else "has only one vertex"
                 allowed = f"two or more vertices, the first of them one of {', '.join(free)}"
-                hint = f"list first the vertex at which '{name}' leaves the main branch, such as {free[0]}"
+                where, hint = f"cable: child_branch_vertex_names.{name}", f"begin the list with {free[0]}, for example"
                 raise ModelError(f"branch '{name}' {why}", where=where, allowed=allowed, hint=hint)
         known = self.undeformed_positions
         require_known_names(self.vertex_names, known, "undeformed position of vertex", "cable", ModelError)
@@ -88,8 +83,7 @@ class CableVertices:
             twice = max(self.vertex_names, key=self.vertex_names.count)
             branches = " and ".join(name for name, own in self.vertex_names_by_branch.items() if twice in own)
             what, hint = f"vertex '{twice}' is listed twice, in {branches}", "remove it at one of the places"
-            allowed = "every vertex once; only the first vertex of a branch is also one of the main branch"
-            raise ModelError(what, where="cable", allowed=allowed, hint=hint)
+            raise ModelError(what, where="cable", allowed="every vertex in one branch", hint=hint)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:

@@ -102,8 +102,7 @@ def read_vertex_positions_by_name(path: str | Path) -> dict[str, Array]:
         allowed = "columns point, x, y, z with numbers in metres"
         is_lost = isinstance(error, KeyError)
         what = f"the table of vertices has no column {error}" if is_lost else f"a coordinate is not a number ({error})"
-        hint = "write the header point,x,y,z, then one row for each point, such as p0,0.1,0.0,0.25"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
+        raise DataError(what, where=str(path), allowed=allowed, hint="write rows such as p0,0.1,0.0,0.25") from error
 
 
 def length_parameters_from_edges(cable: CableVertices, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:

@@ -119,11 +119,8 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
     length, mass, radius = base.extract_required_object_numbers("each branch of a tree", numbers, wanted)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
-        what, hint = (
-            f"--branches is {count}, but must be from 1 to 16",
-            "describe each by --branch, or set --branches 4",
-        )
-        raise ConfigError(what, where="--branches", allowed="a whole number from 1 to 16", hint=hint)
+        what = f"the tree has {count} branches, but must have 1 to 16"
+        raise ConfigError(what, where="--branches", allowed="a whole number", hint="set --branches 4, for example")
     # perpendicular to the holder's z axis, the first one along its x axis
     turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
     branches = enumerate((_init_segment(links, length, mass, radius, rpy=turn) for turn in turns), 1)
@@ -156,13 +153,12 @@ def _branch(text: str, links: int) -> tuple[str, _SegmentGeometry]:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
     count = len(numbers.split(","))
+    hint = "write for example --branch left=0.4,0.03,0.008"
     if not (name and equals) or (at and not parent) or count not in (3, 6):
-        what, hint = f"'{text}' does not describe a branch", "write for example --branch left=0.4,0.03,0.008"
-        raise ConfigError(what, where="--branch", allowed=_BRANCH_SHAPE, hint=hint)
+        raise ConfigError(f"'{text}' does not describe a branch", where="--branch", allowed=_BRANCH_SHAPE, hint=hint)
     values = base.parse_comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
         what, allowed = f"'{text}' has a size that is not above 0", "length [m], mass [kg] and radius [m] above 0"
-        hint = "write for example --branch left=0.4,0.03,0.008"
         raise ConfigError(what, where="--branch", allowed=allowed, hint=hint)
     turn = (values[3], values[4], values[5]) if count == 6 else _NO_TURN
     return name, _init_segment(links, values[0], values[1], values[2], rpy=turn, parent=parent or None)
