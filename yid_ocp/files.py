@@ -44,7 +44,8 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         if isinstance(error, ValueError):
             what, allowed = "the path contains a null character", "a path without null characters"
         near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
-        hint = nearest_name_question(path.name, near) or f"correct the path: `ls {path.parent}` lists its folder"
+        hint = f"`ls {path.parent}` lists names" if os.path.isdir(path.parent) else f"there is no folder {path.parent}"
+        hint = nearest_name_question(path.name, near) or f"correct the path: {hint}"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
         hint = f"allow reading by `chmod u+r {path}`, or copy the file to a folder of your own"
@@ -157,8 +158,7 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
     except OSError as error:
         file = next((part for part in (path, *path.parents) if is_file(part)), None)
         why = f"because {file} is a file" if file else f"({os_error_reason(error)})"
-        hint = "choose another folder, in which you may write" + (f", or rename {file}" if file else "")
-        raise OutputError(f"{what} cannot be made {why}", where=str(path), hint=hint) from error
+        raise OutputError(f"{what} cannot be made {why}", where=str(path), hint="choose a writable folder") from error
     return path
 
 

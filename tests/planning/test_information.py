@@ -284,7 +284,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
         ({"effects_to_discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("which is 0.3 rad beyond its limit",)),
         ({"limits": PlanLimits(effort_fraction=1e-4)}, ("exceed their limits before they move", "limit 0.004")),
-        ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),
+        ({"n_random_starts": 0}, ("n_random_starts is 0", "from 1")),
     ],
 )
 def test_what_is_refused(refused_with, moved_problem, more, words):

@@ -213,7 +213,7 @@ def _made(
     position = np.stack([table[:, list(at)] for at in columns.values()], axis=1)
     position[np.isnan(position).any(axis=2)] = math.nan
     group = PointGroup("points", tuple(columns), t, position, None, program, clock="nominal")
-    return group, unit, (f"an export of {program}: {len(columns)} points in {unit}", *notes)
+    return group, unit, (f"the file is an export of {program} with {len(columns)} points in {unit}", *notes)
 
 
 def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array:

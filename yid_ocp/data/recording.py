@@ -546,7 +546,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    what, allowed = f"the array has shape {array.shape}, but must have {shape}", f"{letters} (see recordings.md)"
+    what, allowed = f"the array has shape {array.shape}, but must have {shape}", f"{letters}, as in recordings.md"
     hint = "transpose it" if array.shape[::-1] == shape else "write one row for each time and one entry for each name"
     raise_data_error_unless(array.shape == shape, what, where, allowed, hint)
 

@@ -112,7 +112,7 @@ class OpenBag:
             what, otherwise = f"the bag has no {noun} on the topic '{name}'", "choose a topic that `--preview` lists"
             raise DataError(what, where=str(self.path), **unknown_name_error_arguments(name, known, otherwise))
 
-    def no_usable_topics_error(self, what: str, allowed: str, hint: str = "use the bag that has it") -> DataError:
+    def no_usable_topics_error(self, what: str, allowed: str, hint: str = "use a bag that has them") -> DataError:
         """Return the `DataError` for a bag without usable topics. Its text lists the topics of the bag."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "none"
         return DataError(what, where=f"{self.path}, topics: {held}", allowed=allowed, hint=hint)

@@ -267,7 +267,7 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:
-            left[name] = f"a {dataset.info.features[name].dtype or 'feature'} feature that is not understood"
+            left[name] = f"features of type '{dataset.info.features[name].dtype or 'unknown'}' are not used"
             continue
         values = table[name]
         named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
