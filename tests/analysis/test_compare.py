@@ -79,7 +79,7 @@ def test_nothing_to_agree_on(repository, carried_out):
     text = done.out
     assert "single_shooting did not converge" in text
     assert "multiple_shooting did not converge: IPOPT stopped after 2 iterations" in text
-    assert "no parameter can be found from these recordings, so there is nothing to agree on" in text
+    assert "No parameter can be found from these recordings, so there is nothing to agree on." in text
     values = [entry["parameters"]["spring_1.stiffness"]["value"] for entry in done.result["methods"].values()]
     page = (done.folder / "report.html").read_text(encoding="utf-8").partition("<script")[0]
     assert not [
@@ -117,7 +117,7 @@ def test_command_weighs_all_noise_of_the_embedded_recordings(repository, carried
     """Torques with offsets mislead what takes them as true; the verdicts do not follow it."""
     config = repository / "configs" / "dual_arm_no_vision.yaml"
     done = carried_out("compare", config, settings=["compare.methods={single_shooting: {}}"])
-    assert done.out.startswith("do not use values by single_shooting: they ignore noise")
+    assert done.out.startswith("Do not use values by single_shooting: they ignore noise")
     result = done.result
     assert result["judged"]["fit"]["explains"]
     assert not result["methods"]["single_shooting"]["fit"]["explains"]

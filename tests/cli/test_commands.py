@@ -82,7 +82,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
     assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
     assert (result["fit"]["explains"], result["fit"]["worse_than_guess"]) == (True, [])
     assert 0.01 < result["fit"]["p_value"] <= 1
-    assert "the model explains the recordings to within their noise" in done.out
+    assert "The model explains the recordings to within their noise" in done.out
     channel = result["residuals"]["joints.effort.shoulder"]
     assert set(result["discretisation"]) == set(pendulum_data.truth)
     for name, moved in result["discretisation"].items():
@@ -90,7 +90,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert moved["links"] is None
         assert abs(moved["time_step"]) < 0.01 * pendulum_data.truth[name]
         assert 0 < moved["std"] <= result["parameters"][name]["std"]
-    assert done.out.count("with half the time step") == 1
+    assert done.out.count("With half the time step") == 1
     assert (set(channel), channel["unit"]) == ({"rmse", "unit", "n"}, "N m")
     assert 0.005 < channel["rmse"] < 0.02
     held_out = result["held_out"][0]
@@ -216,7 +216,7 @@ def test_check(carried_out, pendulum):
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
     assert {"time_step", "links", "encoder_noise", "std"} == set(result["discretisation"]["shoulder.stiffness"])
-    assert "test of links and time steps at the initial values (`solve` repeats it at its estimates):" in done.out
+    assert "Test of links and time steps at the initial values (`solve` repeats it at its estimates):" in done.out
     assert "100 Hz" in done.out
     assert "run folder: run" in done.out
     assert not any("effort_kind" in text for text in result["warnings"])

@@ -165,7 +165,7 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=N
 
 def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> EffectAmplitudeTransferCheck:
     """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return EffectAmplitudeTransferCheck("friction@elbow", name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+    return EffectAmplitudeTransferCheck("friction@elbow", name, "N m", *np.ravel([values, stds], "F"), 0.0, agrees)
 
 
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")

@@ -179,7 +179,7 @@ HEAD = "quantity,unit,at,torque,std\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a,b\n1,2\n", "not a table of a torque law"),
+        ("a,b\n1,2\n", "not that of a torque law"),
         (HEAD + "angle,rad,0,x,1\n", "line 2"),
         (HEAD + "".join(f"speed,rad/s,{x},0,0\n" for x in range(5)), "the law depends on angle"),
         (HEAD + "".join(f"angle,rad,{x},0,0\n" for x in (0, 1, 3, 4)), "evenly spaced"),
@@ -194,7 +194,7 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
 
 
 def test_a_law_has_a_place_and_a_quantity_there(system):
-    with pytest.raises(ConfigError, match="no location 'nowhere'"):
+    with pytest.raises(ConfigError, match="cannot act at 'nowhere'"):
         torque_law_from_tables("nowhere", system, tables())
     with pytest.raises(ConfigError, match="cannot depend on 'command'"):
         torque_law_from_tables("elbow", system, tables(quantities=("command",)))

@@ -129,7 +129,7 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     other = replace(f.carried("b"), effect_label="offset@wrist")
     chosen, checks = tuple(map(f.added, (FRICTION, OFFSET))), (f.carried(), other, f.carried("c", agrees=True))
     told = f.finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_checks=checks).to_dict()
-    both = f"{f.carried().both_estimates_text}; {other.both_estimates_text}"
+    both = f"{f.carried().disagreement_text}; {other.disagreement_text}"
     assert [entry["reason"] for entry in told["rejected_candidates"]] == [both, both]
 
 

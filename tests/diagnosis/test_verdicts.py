@@ -206,7 +206,7 @@ def short(bench):
         (["joint_coulom"], ("joint_coulom", "joint_coulomb")),
         (["joint_coulomb@elbo"], ("elbo", "elbow")),
         (["camera_latency"], ("camera_latency is not possible for this model", "camera")),
-        ([], ("list of candidates is empty",)),
+        ([], ("candidates are []",)),
         ("everything", ("all",)),
     ],
 )

@@ -93,7 +93,7 @@ def test_a_rollout_beyond_all_memory(refused_with, urdf_folder, use_compiler):
 
 
 def test_fewer_directions_than_parameters_are_refused():
-    with pytest.raises(ModelError, match="1 directions for 2 parameters"):
+    with pytest.raises(ModelError, match="1 columns for 2 parameters"):
         SensitivityDirections(("a", "b"), np.zeros((4, 1)))
 
 

@@ -214,7 +214,7 @@ class TestFailures:
         torque[7] = math.nan
         rollout = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
         assert (rollout.status.code, rollout.status.completed_steps) == (NewtonStatusCode.NOT_FINITE, 7)
-        assert rollout.status.message.startswith("step 7: the state is no longer finite")
+        assert rollout.status.message.startswith("at step 7, the state is no longer finite")
         assert np.all(np.isfinite(rollout.state[:8]))
         assert np.all(np.isnan(rollout.state[9:]))
         assert np.all(np.isnan(rollout.multipliers[7:]))
@@ -235,7 +235,7 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
     trep, theta = golden("single"), theta_golden("single")
     *_, status = single_step(trep.q[0], trep.p[0], 1e6 * trep.u[0] + 1e7, theta)
     assert not status.is_converged
-    assert "step 0: Newton's method found no solution" in status.message
+    assert "at step 0, Newton's method found no solution" in status.message
     *_, status = single_step(trep.q[0], trep.p[0], trep.u[0], theta)
     assert (status.is_converged, status.message, status.completed_steps) == (True, "converged", 1)
     assert status.newton_iterations >= 1
@@ -245,7 +245,7 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        *(({"time_step": h}, [f"time_step = {h}", "a number above 0 [s]"]) for h in (0.0, -0.01, math.nan, math.inf)),
+        *(({"time_step": h}, [f"time_step is {h}", "a number above 0 [s]"]) for h in (0.0, -0.01, math.nan, math.inf)),
         ({"force_split": "right"}, ["no rule 'right'", "force_split", "symmetric, left"]),
         ({"constraint_force_at": "end"}, ["no rule 'end'", "constraint_force_at", "node, midpoint"]),
     ],
@@ -295,7 +295,7 @@ def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
         np.testing.assert_array_equal(one, other)
     assert coarse.time_step == 4e-3
     assert np.max(np.abs(coarse(*at)[0] - made[0])) > 1e-6
-    with pytest.raises(ModelError, match="time_step = 0"):
+    with pytest.raises(ModelError, match="time_step is 0"):
         step_with_time_step(coarse, 0.0)
 
 

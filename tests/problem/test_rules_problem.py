@@ -245,7 +245,7 @@ def test_a_problem_whose_rollout_fails_says_why(make):
     assert not failing.ok
     assert (failing.cost, failing.jacobian) == (math.inf, None)
     assert failing.episode_predictions == failing.equilibrium_guesses == ()
-    assert failing.message.startswith("in 'run_1', no equilibrium found")
+    assert failing.message.startswith("in 'run_1', no equilibrium was found")
     cost, gradient, same = problem.cost_and_gradient([1e8])
     assert (cost, gradient.tolist(), same.ok) == (math.inf, [0.0], False)
 

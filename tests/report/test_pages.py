@@ -230,10 +230,10 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(moved, nominal_model=quiet), tmp_path))
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
-    assert "Analysis of the nominal model, without the effects that explain the gap: every coordinate" in text
+    assert "every coordinate of the nominal model (without the effects that explain the gap) an" in text
     assert "would have been detected" in text
-    assert "Most probably the gap lies in the mechanics or what the effort sensors read" in text
-    assert "Values: joint_coulomb@elbow" in text
+    assert "Most probably the origin of the gap is the mechanics or the effort sensor, which" in text
+    assert "The values are joint_coulomb@elbow" in text
     assert "No two signatures are similar in both directions" in text
     assert "The most significant value is that of elbow" in text
     assert f"{name} goes from" in text
@@ -270,7 +270,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     assert 'id="events"' in page
     text = text_of(page)
     assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text
-    assert "Data of run after 1.5 s are ignored" in text
+    assert "Data of 'run' after 1.5 s are ignored" in text
     assert 'id="events"' not in page_of(found["no_gap"], tmp_path)
 
 

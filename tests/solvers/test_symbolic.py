@@ -173,14 +173,14 @@ def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
 
 def test_what_it_does_not_do_is_refused(urdf_folder):
     step = pendulum_step(urdf_folder, (("camera_latency", "camera", {"delay": 0.0137}),))
-    with pytest.raises(SolverError, match="an effect changes recorded inputs, times"):
+    with pytest.raises(SolverError, match="an effect that changes recorded inputs, times"):
         transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",)))
 
 
 def test_blocks_are_named_after_what_they_hold(urdf_folder):
     problem = problem_of(urdf_folder, "driven, proportional")
     program = transcribe(problem)
-    with pytest.raises(SolverError, match="'q' is ambiguous"):
+    with pytest.raises(SolverError, match=r"'q' names [0-9] blocks"):
         program["q"]
     assert program["q[run_2]"].shape == (2, STEPS + 1)
     assert program["torque[run_1]"].shape == (1, STEPS)
@@ -353,7 +353,7 @@ def test_what_is_added_must_fit():
     program = chain()
     with pytest.raises(SolverError, match="'other' is neither a variable nor a parameter"):
         program.with_user_terms(ca.MX.sym("other") * program.w[0])
-    with pytest.raises(SolverError, match="3 lower bounds for 2 constraints"):
+    with pytest.raises(SolverError, match="3 lower bounds are given for 2 constraints"):
         program.with_user_terms(0.0, program.w[:2], [0.0, 0.0, 0.0])
     with pytest.raises(SolverError, match="CasADi cannot make the solver 'no_such_plugin'"):
         program.make_solver("no_such_plugin")

@@ -237,8 +237,8 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     assert write_report(tmp_path / "report.html", ReportData("blind", "", result, section_data={"pictures": files}))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png') == 3
-    assert f"synthetic cases: {len(marks)} (random seed 1" in page
-    assert ("false alarms: a gap was found in 0 of 5 cases" in page) == bool(marks)
+    assert f"The blind test has {len(marks)} synthetic cases (seed 1" in page
+    assert ("False alarms: a gap was found in 0 of 5 cases" in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
     with pytest.raises(OutputError, match="cannot be written"):
         draw_blind_validation_figures(tmp_path / "nowhere", result)

@@ -85,8 +85,8 @@ def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
         if name in problem.options.local_parameters:
             what = f"the baseline cannot give a prior of '{name}', which has its own value in every recording"
             where = f"parameters.{name}.per_recording"
-            hint = "leave `per_recording` out, or diagnose without --baseline"
-            raise ConfigError(what, where=where, allowed="`per_recording: false`", hint=hint)
+            hint = f"set {where}: false, or diagnose without a baseline (--baseline, baseline)"
+            raise ConfigError(what, where=where, allowed="false, or no baseline with this parameter", hint=hint)
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
@@ -283,7 +283,7 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     problem = _on(last, without).with_free_parameters_without_recompiling(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
-        what = "the nominal model cannot be fitted to the recordings without the effects"
-        allowed, hint = "recordings of this setup without effects", "correct the list recordings.without_effect"
-        raise SolverError(f"{what}: {outcome.message}", where="recordings", allowed=allowed, hint=hint)
+        what = f"the fit of the nominal model to the recordings without the effects failed: {outcome.message}"
+        allowed, hint = "recordings of this setup without effects", "remove recordings of other setups from this list"
+        raise SolverError(what, where="recordings.without_effect", allowed=allowed, hint=hint)
     return {name: problem.unknowns.named_values(outcome.x)[name] for name in shared}

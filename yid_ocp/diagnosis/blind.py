@@ -77,7 +77,8 @@ def plan_blind_cases(
     needs an experiment in `chains`. `seed` and `purpose` determine the order. Raises `ConfigError` if `count` < 1.
     """
     if count < 1:
-        raise ConfigError(f"the number of cases is {count}", where="--cases", allowed="a whole number from 1")
+        what, hint = f"the number of cases is {count}, but must be at least 1", "set --cases 1 or more"
+        raise ConfigError(what, where="--cases", allowed="a whole number from 1", hint=hint)
     total = sum(weights.values())
     kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
     kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}
@@ -178,7 +179,7 @@ def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]
 def read_labels_checking_sha256(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read the sealed labels of cases from JSON `text`. Raises `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
-        what, hint = "the labels are not those sealed before the diagnosis", "copy the original file back"
+        what, hint = "sealed/labels.json was changed after the diagnosis began", "copy the original file back"
         where, allowed = "sealed/labels.json", f"the file with the SHA-256 in commitment.json, {commitment[:12]}..."
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -228,10 +229,11 @@ class BlindCaseGenerator:
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
-            what, allowed = "a blind test needs driven arms only", "a robot with driven and without prescribed joints"
+            what, allowed = "the arms have prescribed joints, or no driven ones", "driven joints alone"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         if seed < 0:
-            raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
+            what, hint = f"the seed is {seed}, but must be at least 0", "set --seed 0 or more"
+            raise ConfigError(what, where="--seed", allowed="a whole number from 0", hint=hint)
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
@@ -240,7 +242,7 @@ class BlindCaseGenerator:
         self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
-            what, hint = "the blind test can inject none of the candidates", "add one of the allowed kinds"
+            what, hint = "the blind test cannot inject any of the candidates", "add one of these kinds to this list"
             raise ConfigError(what, where="diagnosis.candidates", allowed=", ".join(INJECTABLE_EFFECT_KINDS), hint=hint)
 
     def _rng(self, *path: int) -> np.random.Generator:
@@ -354,7 +356,7 @@ class BlindCaseGenerator:
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
         what, allowed = f"all {MAX_DRAWS_PER_CASE} random motions diverge in MuJoCo", "one motion that stays finite"
-        where, hint = f"{name} of {planned.experiment}", "set another --seed; next, a larger model.damping"
+        where, hint = f"{name} of experiment {planned.experiment}", "set another --seed; next, a larger model.damping"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
@@ -471,8 +473,8 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
     if joints is None or missing:
-        what, hint = f"the first recording lacks the driven joint '{missing[0]}'", "import this joint too"
-        raise ConfigError(what, where="recordings.estimate", allowed="a recording of all driven joints", hint=hint)
+        what, hint = f"recording '{recording.name}' lacks the driven joints {', '.join(missing)}", "import them too"
+        raise ConfigError(what, where="recordings.estimate", allowed="recordings of all driven joints", hint=hint)
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 

@@ -95,7 +95,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
-        reason = "; ".join(check.both_estimates_text for check in self.failed_transfer_checks)
+        reason = "; ".join(check.disagreement_text for check in self.failed_transfer_checks)
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",

@@ -57,20 +57,20 @@ def make_candidate_effects(
     if choice == "all":
         return [_make_candidate(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
-        what = f"'{choice}' is neither 'all' nor a list" if choice else "the list of candidates is empty"
-        raise ConfigError(what, where=where, allowed="all, or a list of kinds", hint=f"leave {where} out to try all")
+        what, hint = f"the candidates are {choice!r}, but must be 'all' or a list", f"leave {where} out to try all"
+        raise ConfigError(what, where=where, allowed="all, or a list of kinds such as [joint_coulomb]", hint=hint)
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
         if text in present:
-            what, allowed = f"the model already has the effect {text}", "effects that the model does not have"
-            raise ConfigError(what, where=where, allowed=allowed, hint="remove it from the list")
+            what, allowed = f"the candidate {text} is already in the model", "effects that the model does not have"
+            raise ConfigError(what, where=where, allowed=allowed, hint=f"remove {text} from this list")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
             missing = ", ".join(sorted(cls.required_sensors - sensors))
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
-            allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), "remove it from the list"
+            allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), f"remove {kind} from this list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]
     return [_make_candidate(kind, place, system) for kind, place in pairs]
@@ -96,7 +96,7 @@ def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> 
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
     if not kept:
         what, allowed = f"all {len(effects)} candidates are excluded", f"at most {len(effects) - 1} excluded candidates"
-        raise ConfigError(what, where=where, allowed=allowed, hint="exclude fewer candidates")
+        raise ConfigError(what, where=where, allowed=allowed, hint="remove at least one name from this list")
     return kept
 
 
@@ -148,8 +148,8 @@ class AllCandidatesProblem:
         held = [*held_out] or [episode.recording for episode in problem.held_out]
         if repeated := [own.name for own in held if any(_same(own, other) for other in estimate)]:
             what = f"recording '{repeated[0]}' is used both for the estimate and as held-out recording"
-            hint = "hold out other recordings, or none: then blocks of time of the recordings are held out"
-            raise DataError(what, where="held_out", allowed="held-out recordings of other motions", hint=hint)
+            hint = "pass other recordings; without held-out ones, blocks of time of the recordings are held out"
+            raise DataError(what, where="held_out, recordings.held_out", allowed="other recordings", hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra, problem)
@@ -308,7 +308,7 @@ def make_all_candidates_problem(
 ) -> AllCandidatesProblem:
     """Return the problem with all `candidates` except `leave_out` as candidates to try. Errors are as in `diagnose`."""
     if problem.options.weighting != "whitened":
-        what = "a diagnosis needs residuals that are divided by their noise"
+        what = f"problem.weighting is '{problem.options.weighting}', but a diagnosis needs 'whitened' residuals"
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)

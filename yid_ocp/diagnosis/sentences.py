@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.events import EventSet
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
@@ -24,10 +23,12 @@ _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is 
 _MAX_CHANGES = 5  # number of named parameters, the largest changes first
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
-_GAP_ORIGIN_PHRASES = {
-    "plant": "; its origin is the mechanics, not a sensor",
-    "sensor": "; its origin is a sensor, not the mechanics",
-    "either": "; its origin is the mechanics or the effort sensor, which efforts alone cannot distinguish",
+GAP_ORIGIN_TEXTS = {
+    "plant": "the mechanics, not a sensor",
+    "sensor": "a sensor, not the mechanics",
+    "either": "the mechanics or the effort sensor, which efforts alone cannot distinguish",
+    "both": "both the mechanics and a sensor",
+    "none": "neither the mechanics nor a constant error of a sensor, as far as these unknowns can show",
 }
 
 
@@ -59,50 +60,45 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
     stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.0f} s. Not tested: "
-    text = [_gap(result), _listed(stopped, result.untried, ". Raise the limit to test them.")]
+    text = [_gap(result), _listed(stopped, result.untried, ". To test them, raise diagnosis.budget.")]
     if result.verdict not in ("insufficient_data", "no_gap"):
         (error, change), found = _remains(result), [_places(result), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
     text += [] if result.law is None else [result.law.sentence]
-    text += [*map(held_out_truncation_message, result.truncated_recordings)]
-    text += [*_bound_by_priors(result), *_earlier_runs(result)]
+    text += [*map(held_out_truncation_message, result.truncated_recordings), *_bound_by_priors(result)]
+    text += _earlier_runs(result)
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    links = "Too few links cause an error, which the diagnosis subtracted. For other commands, double the links."
-    notes = (
-        (stated != used, f"{step} (set problem.time_step: {used} for other commands)."),
-        (result.is_corrected_for_links, links),
-        (result.is_split_in_blocks, "Held-out motions are every second block of time: no recording could be held out."),
-    )
-    text += _applying(notes)
+    links = "Too few links cause an error, which the diagnosis subtracted. For other commands, double `links` in model."
+    blocks = "Every second block of time is held out, because no recording could be held out."
+    text += [f"{step} (set problem.time_step: {used} for other commands)." * (stated != used)]
+    text += [links * result.is_corrected_for_links, blocks * result.is_split_in_blocks]
     kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
-    listed = [f"{kinds[e.kind]} {e.channel} at {e.start_time:.2f} s of '{e.recording}'" for e in events]
-    text += [_listed("Brief disturbances were excluded: ", listed, ". If you did not cause them, check these times.")]
-    text += [*overspeed_truncation_messages(result.events), f"Next experiment: {result.next_experiment}"]
+    where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
+    told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
+    check = "If you did not cause them, check these times."
+    text += [_listed("Brief disturbances were removed before the tests: ", told, f". {check}")]
+    text += [*overspeed_truncation_messages(result), f"Next experiment: {result.next_experiment}"]
     return "\n".join(filter(None, text))
 
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = f"only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s are used"
-    return f"Of held-out recording '{cut.recording}' {used}: then the simulation of the nominal model fails."
+    used = f"only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s are used; then its simulation fails"
+    return f"Of held-out recording '{cut.recording}' {used}. To use more, set a smaller problem.time_step."
 
 
-def overspeed_truncation_messages(events: EventSet) -> list[str]:
+def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
-    cut, why = "s are ignored, because", "then moves faster than diagnosis.max_joint_speed."
-    return [f"Data of {e.recording} after {e.start_time:.3g} {cut} {e.joint} {why}" for e in events.overspeeds]
+    why = f"then moves faster than diagnosis.max_joint_speed ({result.thresholds.max_joint_speed:g} rad/s or m/s)."
+    cut, cuts = "s are ignored, because", result.events.overspeeds
+    return [f"Data of '{e.recording}' after {e.start_time:.3g} {cut} {e.joint} {why}" for e in cuts]
 
 
 def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) -> str:
     """Sentence on names, similar ones merged. Empty if there are none."""
     text = abbreviated_names_text([*names], **limit)
     return f"{beginning}{text}{end}" if text else ""
-
-
-def _applying(notes: Iterable[tuple[bool, str]]) -> list[str]:
-    """The texts whose condition holds."""
-    return [text for applies, text in notes if applies]
 
 
 def _gap(result: DiagnosisResult) -> str:
@@ -113,13 +109,12 @@ def _gap(result: DiagnosisResult) -> str:
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
     p_text, detectable = p_value_relation_text(p_value), f"would show {sum(seen)} of {len(seen)} effects"
-    said = f"{tests[0].degrees_of_freedom:.0f} independent samples for {unknowns} unknowns, and {detectable}"
     if result.verdict == "insufficient_data":
-        needed = "It needs more samples than unknowns, and at least one effect that they would show: record longer or "
-        needed += "other motions (`yid-ocp plan`), or fix known parameters (parameters.NAME.free: false)."
-        return f"The recordings are insufficient for a diagnosis: they have {said}. {needed}"
+        dof, few = f"{tests[0].degrees_of_freedom:.0f}", f"more than {unknowns}, the number of unknowns, are needed"
+        said = f"they have {dof} independent samples ({few}), and {detectable} (at least 1 is needed)"
+        return f"The recordings are insufficient for a diagnosis: {said}."
     if result.verdict == "no_gap":
-        return "\n".join([f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)])
+        return "\n".join(filter(None, [f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]))
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
@@ -137,12 +132,12 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
     small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
-    seen = f"The error has the pattern of {''.join(best)} (noise alone: p {p_value_relation_text(along)})"
+    seen = f"The error has the pattern of {''.join(best)} (p {p_value_relation_text(along)} if there is only noise)"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
     blind = _listed("These motions would not show the following effects, even if they exist: ", unseen)
-    return _applying([(is_significant, small), (along < level, narrow), (bool(unseen), blind)])
+    return [small * is_significant, narrow * (along < level), blind]
 
 
 def _places(result: DiagnosisResult) -> str:
@@ -154,7 +149,8 @@ def _places(result: DiagnosisResult) -> str:
     assert result.smoother_result is not None  # it found the locations
     parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= 0.005 else []
     named = ", ".join(f"{100 * part:.0f} % comes from {place}" for part, place in parts)
-    side = _GAP_ORIGIN_PHRASES.get(result.smoother_result.plant_or_sensor_origin, "")
+    origin = result.smoother_result.plant_or_sensor_origin
+    side = f"; its origin is {GAP_ORIGIN_TEXTS[origin]}" if origin in ("plant", "sensor", "either") else ""
     return f"Of the error beyond noise that can be located, {named}{side}."
 
 
@@ -175,13 +171,13 @@ def _causes(result: DiagnosisResult) -> list[str]:
     text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
-    apart = [entry.both_estimates_text for entry in result.failed_transfer_checks[:2]]
-    differ = "No cause is named, because estimates differ by more than 70 % of the effect and 2 standard deviations"
+    apart = ". ".join(entry.disagreement_text for entry in result.failed_transfer_checks[:2])
+    either, none = f"Either {names} changed between recordings, or another cause acts", "No cause is named, because"
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
-        "none": "None of the effects that were tried explains the error well enough, so no cause is named.",
-        "little": f"{names} explain{s} {own:.3g} % of the error beyond noise on fitted motions ({goal:.3g} % needed).",
-        "stand_in": f"{differ}: {'; '.join(apart)}. {names} may imitate another cause, or change between recordings.",
+        "none": f"{none} none of the effects that were tried explains the error well enough.",
+        "little": f"{none} {names} explain{s} only {own:.3g} % of the error on fitted motions ({goal:.3g} % needed).",
+        "stand_in": f"{none} {names} do{'es' * bool(s)} not transfer to the held-out recordings: {apart}. {either}.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
 
@@ -192,8 +188,9 @@ def _several_places(result: DiagnosisResult) -> str:
     best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
     places = abbreviated_names_text([s.effect.location for s in alike])
+    said = f"{''.join(best)} is significant (corrected p below {level:g}) at each of these locations: {places}."
     advice = "Add it there under model.effects; for friction of joints, run `yid-ocp friction`."
-    return f"{best[0]} is significant at {places}. {advice}" if result.unknown_reason and len(alike) > 1 else ""
+    return f"{said} {advice}" if result.unknown_reason and len(alike) > 1 else ""
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
@@ -262,19 +259,20 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
-        text.append(_listed("Changes since the baseline (the earlier runs): ", moved) or same * (not rivals))
+        text.append(_listed("Significant changes since the baseline (earlier runs): ", moved) or same * (not rivals))
         text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
-        differ = f"Runs of the baseline differ by more than their uncertainty (p = {since.between_runs_p_value:.2g})"
+        p = since.between_runs_p_value
+        differ = f"Runs of the baseline differ by more than their uncertainty (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-        notes = (since.between_runs_p_value < _RUNS_DIFFER_LEVEL, f"{differ}. The ± of the baseline includes this.")
-        text += _applying([notes, (not since.is_baseline_explained, small)])
+        text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
+        text += [small * (not since.is_baseline_explained)]
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():
         names = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
         made = f"Recordings made {how} the effects ({names})"
         plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
         if part.failure_message:
-            text.append(f"{made} could not be predicted ({part.failure_message}).")
+            text.append(f"{made} could not be predicted ({part.failure_message}), so they do not test the effects.")
             continue
         errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")

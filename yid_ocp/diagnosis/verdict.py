@@ -35,20 +35,28 @@ class EffectAmplitudeTransferCheck:
     estimation_std: float
     held_out_value: float
     held_out_std: float
+    neutral_value: float
     is_consistent: bool
 
     @property
-    def both_estimates_text(self) -> str:
-        """A text with both estimates, their standard deviations and unit."""
-        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the fitted recordings"
-        there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
-        return f"{self.effect_label}.{self.parameter} is {here} and {there}"
+    def disagreement_text(self) -> str:
+        """A text with both estimates, their difference and the limits that it exceeds if they are inconsistent."""
+        (apart, spread), unit = self._difference_and_std, f" {self.unit}".removesuffix(" 1")
+        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
+        there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
+        size = abs(self.estimation_value - self.neutral_value) / math.sqrt(2.0)
+        limits = f"2 standard deviations ({2 * spread:.2g}{unit}) and 70 % of the effect ({size:.2g}{unit})"
+        text = f"{self.effect_label}.{self.parameter} is {here} and {there}"
+        return f"{text}, so the difference of {apart:.2g}{unit} exceeds {limits}"
+
+    @property
+    def _difference_and_std(self) -> tuple[float, float]:
+        return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
 
     @property
     def significant_disagreement_as_std(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
-        apart = abs(self.estimation_value - self.held_out_value)
-        spread = math.hypot(self.estimation_std, self.held_out_std)
+        apart, spread = self._difference_and_std
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
@@ -260,8 +268,8 @@ def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics
     for name in effect.amplitude_parameter_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
-        entry = EffectAmplitudeTransferCheck(*what, *own, True)
+        entry = EffectAmplitudeTransferCheck(*what, *own, effect.neutral_values[name], True)
         least = _DISAGREEMENT_Z * entry.significant_disagreement_as_std
-        away.append(abs(entry.estimation_value - effect.neutral_values[name]) > least)
+        away.append(abs(entry.estimation_value - entry.neutral_value) > least)
         found.append(entry)
     return [replace(entry, is_consistent=any(away)) for entry in found]

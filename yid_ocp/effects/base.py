@@ -186,7 +186,8 @@ def make_effect_unchecked(kind: str, location: str, system: System, values: Mapp
             signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
             if not (value > 0 or (signed and value < 0)):
                 allowed = f"{'a number other than zero' if signed else 'a positive number'} [{unit}]"
-                raise ConfigError(f"{name} = {value} is not possible", where=label, allowed=allowed)
+                what, hint = f"{name} is {value}, but must be {allowed}", "correct the value, or leave it out"
+                raise ConfigError(what, where=label, allowed=allowed, hint=hint)
             value = definition.internal_from_reported_value(value)
         given[definition.name] = float(value)
     entries = (

@@ -208,13 +208,13 @@ def torque_law_from_tables(
     label, possible = f"law@{location}", allowed_torque_law_quantity_names(system, location)
     if not possible:
         places = (*base.flexible_segment_names(system), *base.arm_joint_names(system))
-        what, choice = f"there is no location '{location}' for a law", unknown_name_error_arguments(location, places)
+        what, choice = f"a law cannot act at '{location}'", unknown_name_error_arguments(location, places)
         raise ConfigError(what, where=label, **choice)
     definitions, entries = [], []
     for table in tables:
         if table.quantity not in possible:
             allowed, what = ", ".join(possible), f"a law at {location} cannot depend on '{table.quantity}'"
-            raise ConfigError(what, where=label, allowed=allowed, hint="set depends_on to an allowed quantity")
+            raise ConfigError(what, where=label, allowed=allowed, hint=f"set depends_on: {possible[0]}")
         for k, (at, torque) in enumerate(zip(table.knots, table.torque, strict=True)):
             said = f"torque at {at:.4g} {TORQUE_LAW_QUANTITY_UNITS[table.quantity]}"
             name, size = f"{table.quantity}{k}", min(torque_scale, 1e6)
@@ -234,7 +234,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
     hint = "write the table like law.csv in a run folder of `yid-ocp diagnose`"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
-        raise DataError("the file is not a table of a torque law", where=f"{path}, line 1", allowed=allowed, hint=hint)
+        raise DataError("the header is not that of a torque law", where=f"{path}, line 1", allowed=allowed, hint=hint)
     rows: dict[str, list[list[float]]] = {}
     for number, words in enumerate(lines[1:], 2):
         try:
@@ -243,7 +243,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
             if len(numbers) != 3 or not all(map(math.isfinite, rows[quantity][-1][:2])):
                 raise ValueError
         except ValueError:
-            what = f"line {number} is not a quantity, its unit and three numbers"
+            what = f"the row '{','.join(words)}' is not a quantity, its unit and three numbers"
             raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=hint) from None
     wanted = depends_on.split("+")
     if set(rows) != set(wanted):
@@ -256,7 +256,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
         gaps = np.diff(knots)
         if len(knots) < 4 or np.any(gaps <= 0) or np.ptp(gaps) > _SPACING_RTOL * float(np.mean(gaps)):
             fault = "fewer than 4" if len(knots) < 4 else "not increasing" if np.any(gaps <= 0) else "not evenly spaced"
-            what, hint = f"values `at` of {quantity} are {fault}", "interpolate the table at evenly spaced values"
+            what, hint = f"the values `at` of {quantity} are {fault}", "interpolate the table at evenly spaced values"
             raise DataError(what, where=str(path), allowed="four or more evenly spaced, increasing numbers", hint=hint)
         tables.append(TorqueLawTable(quantity, knots, torque, std))
     return tuple(tables)

@@ -89,7 +89,7 @@ class ResidualDerivativesByStateAndEffort:
             used = samples.evaluation_node_indices
             if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
-                message = f"the Kalman filter for noisy torques cannot use '{name}', which is no sensor of positions"
+                message = f"the Kalman filter for noisy torques cannot use '{name}', because it measures no positions"
                 allowed = "sensors of positions, such as points and encoders"
                 hint = f"set sensors.{name}.use: false, or model.arms.mode: prescribed"
                 raise DataError(message, where=f"sensors.{name}", allowed=allowed, hint=hint)

@@ -443,11 +443,11 @@ VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VE
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     """Return a sentence that states whether a model explains its recordings, with advice for a poor fit."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
-        return "whether the model explains the recordings is not known"
+        return "It is not known whether the model explains the recordings."
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
     if explains:
-        return f"the model explains the recordings to within their noise ({size})"
-    return f"the model does not explain the recordings ({size}). To find the cause, run `yid-ocp diagnose`"
+        return f"The model explains the recordings to within their noise ({size})."
+    return f"The model does not explain the recordings ({size}). To find the cause, run `yid-ocp diagnose`."
 
 
 def value_and_uncertainty_text(

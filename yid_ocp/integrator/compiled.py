@@ -303,7 +303,8 @@ def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names:
     library = compiler.compile_and_load_library(told, source)
     if library is None:
         what, where = "the C compiler failed on the code for parameter derivatives", "the environment variable CC"
-        raise ModelError(what, where=where, allowed="a C compiler, or none", hint="set CC=none (slower)")
+        hint = "set CC to another compiler, such as gcc or clang, or to none (slower)"
+        raise ModelError(what, where=where, allowed="a working C compiler, or none", hint=hint)
     function = ca.external("by_theta", library._name)
     sizes = model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])

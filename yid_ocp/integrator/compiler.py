@@ -51,7 +51,7 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "compiled code cannot be loaded (%s); continuing without it"
+_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (slower)."
 
 
 @functools.cache
@@ -61,11 +61,11 @@ def _compiler_path(wanted: str | None) -> str | None:
     path = next((found for name in names if (found := shutil.which(name))), None)
     if path is None and wanted not in (None, "", "none"):
         allowed, hint = "the name or path of a C compiler, without options, or none", "unset CC to use cc, gcc or clang"
-        what, where = f"there is no compiler '{wanted}'", "the environment variable CC"
+        what, where = f"the C compiler '{wanted}' is not found", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
         why = "CC is none" if wanted == "none" else "no C compiler was found"
-        _LOG.warning("%s: computations run uncompiled, about ten times slower", why)
+        _LOG.warning("Computations run uncompiled and are about ten times slower, because %s.", why)
     return path
 
 
@@ -73,7 +73,7 @@ def _optimization_flag() -> str:
     """Optimisation flag for the step, from the environment variable YID_OCP_OPTIMIZE or the default."""
     level = os.environ.get("YID_OCP_OPTIMIZE", "")
     if level not in ("", "0", "1", "2", "3"):
-        what, where = f"there is no optimisation level '{level}'", "the environment variable YID_OCP_OPTIMIZE"
+        what, where = f"the optimisation level is '{level}', not 0 to 3", "the environment variable YID_OCP_OPTIMIZE"
         hint = "unset the variable, or set it to 0 for many short runs such as tests"
         raise ConfigError(what, where=where, allowed="0, 1, 2, 3", hint=hint)
     return f"-O{level}" if level else _OPTIMIZATION_FLAG
@@ -96,7 +96,7 @@ def private_cache_folder() -> Path:
     if not writable and not wanted:  # as in containers
         return _temporary_cache_folder(folder)
     if not _is_mine_alone(folder.stat()):
-        what = "other users can write to the folder of compiled code, or own it"
+        what = "the folder of compiled code belongs to another user, or others can write to it"
         hint = "set YID_OCP_CACHE to another folder; or, if it is yours, delete its files and run chmod 700 on it"
         raise OutputError(what, where=str(folder), allowed=allowed, hint=hint)
     return folder
@@ -107,8 +107,8 @@ def _temporary_cache_folder(instead_of: Path) -> Path:
     """Path of a cache folder for this process alone, which is removed when the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="yid-ocp-cache-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    message = "the folder of compiled code, %s, is not writable; compiled code is kept for this command only: %s"
-    _LOG.warning(message, instead_of, "set YID_OCP_CACHE to a folder of your own")
+    message = "The folder of compiled code, %s, is not writable, so compiled code is kept for this command only. %s"
+    _LOG.warning(message, instead_of, "To keep it, set YID_OCP_CACHE to a folder of your own.")
     return folder
 
 
@@ -198,10 +198,10 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
                     os.replace(built, target)
                     return target
     except OSError as error:
-        message = "compiled code cannot be stored in %s (%s); continuing without it: %s"
-        _LOG.warning(message, folder, error.strerror or error, "set YID_OCP_CACHE to another folder, or CC=none")
+        message = "Compiled code cannot be stored in %s (%s), so computations run uncompiled (slower). %s"
+        _LOG.warning(message, folder, error.strerror or error, "Set YID_OCP_CACHE to another folder, or CC=none.")
         return None
-    _LOG.warning("the C compiler %s failed; continuing without compiled code:\n%s", path, said[:2000])
+    _LOG.warning("The C compiler %s failed, so computations run uncompiled. It printed:\n%s", path, said[:2000])
     return None
 
 
@@ -213,7 +213,7 @@ def _kept(folder: Path, key: str) -> Path | None:
             own = stat.S_ISREG(info.st_mode) and _is_mine_alone(info)
             if own and path.stem.partition("-")[2] == file_sha256(path)[:32] and _is_ours(path):
                 return path
-        _LOG.warning("a file of compiled code is damaged or belongs to another user; it is compiled again: %s", path)
+        _LOG.warning("The compiled code %s is damaged or belongs to another user, so it is compiled again.", path)
         with contextlib.suppress(OSError):
             path.unlink()
     return None
@@ -221,7 +221,7 @@ def _kept(folder: Path, key: str) -> Path | None:
 
 def _said(command: list[str], patience: float) -> tuple[bool, str]:
     """Whether a program succeeded within `patience` seconds, and its output."""
-    notice = "the C compiler %s has run for %g s; it is stopped after %g s (set CC=none to work without it)"
+    notice = "The C compiler %s has run for %g s. It is stopped after %g s. Set CC=none to work without it."
     timer = threading.Timer(_NOTICE_DELAY, _LOG.warning, (notice, command[0], _NOTICE_DELAY, patience))
     timer.daemon = True
     try:

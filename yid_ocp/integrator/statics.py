@@ -154,7 +154,8 @@ class EquilibriumSolver:
             failed = True
             # with a torque, any of the three starts may lead to a wrong equilibrium
             parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
-            far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
+            limit = f"at most {_MAX_HOLD_DEFLECTION:g} rad is tolerated"
+            far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad ({limit})"
             message = f"the measured {parts} at rest: {far}"
         # torque and posture enter only as torque + holding stiffness * posture
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
@@ -297,7 +298,7 @@ class EquilibriumSolver:
 
     def _explain(self, state: Array, theta: Array, error: float) -> str:
         system, step, e = self.step.system, self.step, self.step.equations
-        text, n = f"no equilibrium found (remaining imbalance {error:.2g} N m or m)", system.n_coordinates
+        text, n = f"no equilibrium was found (the remaining imbalance is {error:.2g} N m or m)", system.n_coordinates
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
         with CASADI_LOCK:

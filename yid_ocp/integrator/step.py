@@ -156,7 +156,7 @@ class Step(ReprMixin):
         if len(ends) != 2:
             what = f"the argument `prescribed` has {len(ends)} entries for {sizes['nc']} prescribed coordinates"
             allowed = f"(s0, s1): their values at the start and at the end of the step, each of shape ({sizes['nc']},)"
-            raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1)")
+            raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1) [rad or m]")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
         start[list(self.system.prescribed_coordinate_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
@@ -217,7 +217,8 @@ def compile_step_like(step: Step, system: System, *, use_compiler: bool | None =
 
 def _positive(time_step: float) -> float:
     if not (math.isfinite(time_step) and time_step > 0):
-        raise ModelError(f"time_step = {time_step} is not positive", where="time_step", allowed="a number above 0 [s]")
+        what, hint = f"time_step is {time_step}, but must be finite and above 0", "for example time_step=0.002"
+        raise ModelError(what, where="time_step", allowed="a number above 0 [s]", hint=hint)
     return time_step
 
 
@@ -227,7 +228,8 @@ def float_array_with_checked_shape(name: str, values: ArrayLike, shape: tuple[in
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
     if array.shape != shape:
-        raise ModelError(f"{name} has shape {array.shape}, not {shape}", where=name, allowed=f"shape {shape}")
+        what, hint = f"{name} has shape {array.shape}, but must have shape {shape}", f"pass {name} with shape {shape}"
+        raise ModelError(what, where=name, allowed=f"shape {shape}", hint=hint)
     return array
 
 
@@ -278,7 +280,8 @@ def checked_rollout_inputs(
     sizes, check = step.sizes, float_array_with_checked_shape
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
-        raise ModelError(f"a simulation has {steps} time steps", where="steps", allowed="a whole number from 1")
+        what, hint = f"the number of time steps is {steps}, but must be at least 1", "pass steps=1 or more"
+        raise ModelError(what, where="steps", allowed="a whole number from 1", hint=hint)
     begin = check("start", start, (nx,)).copy()
     fixed = list(step.system.prescribed_coordinate_indices)
     inputs = np.zeros((steps, nu)) if torque is None else check("torque", torque, (steps, nu))

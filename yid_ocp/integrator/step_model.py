@@ -119,10 +119,10 @@ class RolloutNewtonSummary:
         """A sentence that explains the status, with step, last correction and remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
-        step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
-        said = f"step {step}: {what} (last correction {self.last_correction:.2g})"
-        is_late = step >= _LONG_ROLLOUT_STEPS
-        unstable = is_late and self.code in (NewtonStatusCode.NOT_CONVERGED, NewtonStatusCode.NOT_FINITE)
+        step, is_open = self.completed_steps, self.code == NewtonStatusCode.NOT_CONVERGED
+        size = f" (last correction {self.last_correction:.2g} rad or m)" * is_open
+        said = f"at step {step}, {_STATUS_MESSAGES[self.code]}{size}"
+        unstable = step >= _LONG_ROLLOUT_STEPS and (is_open or self.code == NewtonStatusCode.NOT_FINITE)
         return f"{said}; {_INSTABILITY_HINT}" if unstable else said
 
 
@@ -140,8 +140,9 @@ class SensitivityDirections:
 
     def __post_init__(self) -> None:
         if self.count < len(self.parameter_names):
-            what = f"initial_state_tangents has {self.count} directions for {len(self.parameter_names)} parameters"
-            raise ModelError(what, where="SensitivityDirections", allowed="at least one column for each parameter")
+            what = f"initial_state_tangents has {self.count} columns for {len(self.parameter_names)} parameters"
+            allowed = "at least one column for each parameter"
+            raise ModelError(what, where="SensitivityDirections", allowed=allowed, hint="add the missing columns")
 
     @property
     def count(self) -> int:

@@ -42,8 +42,8 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
         raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed, hint=hint)
     values = np.resize(values, nu)
     if np.any(values < 0):
-        what = f"a tracking gain is negative: {values.min():g} N m/rad"
-        raise ModelError(what, where="problem.arm_proportional_gains", allowed="0 or more [N m/rad]")
+        what, where = f"the tracking gain {values.min():g} N m/rad is negative", "problem.arm_proportional_gains"
+        raise ModelError(what, where=where, allowed="0 or more [N m/rad]", hint="set gains of 0 or more, such as [10]")
     gain = np.broadcast_to(np.diag(values), (len(reference) - 1, nu, nu)).copy()
     return TrackingFeedback(np.array(step.system.actuated_coordinate_indices, np.int32), gain, reference[:-1])
 
@@ -99,7 +99,7 @@ def compile_driven_arms_only_step(step: Step) -> Step:
     system, mechanism = step.system, step.system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
-        what = "the LQR tracking filter requires that the driven joints come first in the configuration vector"
+        what = "the LQR tracking filter cannot be used, because other joints of the model come before the driven ones"
         where, allowed = "problem.arm_tracking_feedback", "driven joints that are the first coordinates of the model"
         raise ModelError(what, where=where, allowed=allowed, hint="set problem.arm_tracking_feedback: proportional")
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint_index < len(keep)}

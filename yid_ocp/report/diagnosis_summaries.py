@@ -67,12 +67,12 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    yield "refitted candidates come first; closure alone: part of the held-out error beyond noise that each one removes"
-    yield "the others are ordered by score (significance before a refit); p: probability of such a score by noise alone"
-    yield f"{left} more candidates are in result.json" if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    yield f"effects that these recordings cannot show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    yield "Refitted candidates come first. Closure alone: part of the held-out error beyond noise that each removes."
+    yield "The others are ordered by score (significance before a refit). p: probability of this score by noise alone."
+    yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
+    yield f"These recordings cannot show the effects {', '.join(result['unseen'])}." if result.get("unseen") else ""
     for signals, kinds in result.get("not_candidates", {}).items():
-        yield f"effects that were not tried, because no recording has {signals}: {', '.join(kinds)}"
+        yield f"These effects were not tried, because no recording has {signals}: {', '.join(kinds)}."
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
@@ -87,9 +87,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     if any(own["severity"] != "warning" for own in result.get("issues", ())):
-        yield "issues of the recordings may have caused this verdict: correct the issues, then diagnose again"
+        yield "Issues of the recordings may have caused this verdict. Correct the issues, then diagnose again."
     if result["next_plan"] is not None:
-        yield "to plan a motion that separates the effects which these recordings cannot distinguish:"
+        yield "This command plans a motion that separates the effects which these recordings cannot distinguish:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield from copyable_estimates_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
@@ -123,13 +123,13 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from others
     yield replace(cases, is_page_only=True)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"synthetic cases: {count} (random seed {result['seed']}, drawn for the purpose '{result['purpose']}')"]
+    said = [f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}')."]
     if right["of"]:
-        said.append(f"true kind and place in the first answer: {right['count']} of {right['of']} cases with a gap")
+        said.append(f"True kind and place in the first answer: {right['count']} of {right['of']} cases with a gap.")
     if result.get("not_judged"):
-        said.append(f"not judged: {result['not_judged']} more cases, as changed thresholds need further fits")
+        said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
     if alarms["of"]:
-        said.append(f"false alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect")
+        said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -148,13 +148,13 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("what", "value, and its binomial 95 % interval"),
         ("false alarms on clean data", sure["false_alarms"]),
         ("true kind and place first, of the detected gaps", sure["kind_first"]),
-        ("among the first two", sure["kind_in_two"]),
-        ("place first", sure["location_first"]),
+        ("true kind and place among the first two", sure["kind_in_two"]),
+        ("true place first", sure["location_first"]),
         ("the named effects, alone or as not separable, include the true one", sure["sets_cover"]),
         ("number of named effects, on average", _number(result["set_size"], ".2f")),
-        ("unknown for effects outside the library", sure["unknown_outside"]),
-        ("unknown for effects removed from it", sure["unknown_left_out"]),
-        ("place first of both", sure["unknown_location"]),
+        ("verdict unknown for effects outside the library", sure["unknown_outside"]),
+        ("verdict unknown for effects removed from it", sure["unknown_left_out"]),
+        ("true place first, of both these sorts", sure["unknown_location"]),
         ("both of a pair, each alone or in a set of three", sure["pairs_right"]),
         ("both of a pair, each alone", sure["pairs_named"]),
         ("closure over that of the true effect refitted", _share(result["closure_of_best"])),
@@ -294,11 +294,11 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    yield "cost compares the methods with each other, chi2 per degree of freedom each with noise (noise alone gives 1)"
+    yield "The cost compares the methods. chi2 per degree of freedom compares each with noise, which alone gives 1."
     yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from result["explained"]
-    agree = "" if objections else "all methods agree within their uncertainty on the parameters that are found"
+    agree = "" if objections else "All methods agree within their uncertainty on the parameters that are found."
     yield SummaryStatement(agree, "conclusion")
 
 
@@ -307,25 +307,25 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
-        words = f"do not use values by {', '.join(methods)}: they ignore noise of the inputs that move the model"
-        yield f"{words}. Use the column `solve`, which includes this noise; the verdicts are for this column"
+        words = f"Do not use values by {', '.join(methods)}: they ignore noise of the inputs that move the model"
+        yield f"{words}. Use the column `solve`, which includes this noise. The verdicts are for this column."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
             if off:
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
-                yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)}"
+                yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)} (more than 2 std away)."
     if stopped:
-        yield f"{', '.join(stopped)}: no values, because the time limit ended before the first iteration"
+        yield f"The time limit ended {', '.join(stopped)} before the first iteration, so there are no values."
     if not fit["explains"]:
-        yield "the model does not explain the recordings, so agreement of methods does not confirm the values"
+        yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
-        yield "the recordings have issues, so agreement of methods does not confirm the values"
+        yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not found:
-        yield "no parameter can be found from these recordings, so there is nothing to agree on"
-        yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help"
+        yield "No parameter can be found from these recordings, so there is nothing to agree on."
+        yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help."
     elif not result["agree"]:
-        yield "the methods do not agree on the parameters that are found; the reasons are below the tables"
+        yield "The methods do not agree on the parameters that are found. The reasons are below the tables."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
@@ -391,9 +391,9 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {p_value_relation_text(entry['p_value'])})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}: without it the other runs agree much better."
+        yield f"Do not trust {' and '.join(wrong)}, because without it the other runs agree much better."
     elif drifted:
-        two = "Two runs that differ do not show which one is wrong; add a third run."
+        two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
     if poor := [entry["name"] for entry in runs if not entry["explains"]]:
         text = f"The model did not explain the recordings of {', '.join(poor)}"
@@ -419,11 +419,12 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
         means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
-        text = f"rms error of {group} on {where}: {texts[0]} ({first}), {texts[1]} ({second})"
-        yield SummaryStatement(f"{text}. The predictions of the runs differ by {texts[2]} (rms)", "conclusion")
-    names = abbreviated_names_text(differing) or "none"
-    yield SummaryStatement(f"parameters that differ by more than {_MAX_RUN_DIFFERENCE} std: {names}", "verdict")
-    yield "std: the larger one of both runs. Both have the same data, so this is no test of significance"
+        text = f"On {where}, the rms error of {group} is {texts[0]} in {first} and {texts[1]} in {second}"
+        yield SummaryStatement(f"{text}. The predictions of the two runs differ by {texts[2]} (rms).", "conclusion")
+    names = f"These parameters differ by more than {_MAX_RUN_DIFFERENCE} std: {abbreviated_names_text(differing)}."
+    none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
+    yield SummaryStatement(names if differing else none, "verdict")
+    yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
     rows = [("recording", "channel", first, second, "difference", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])

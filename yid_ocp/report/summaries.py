@@ -74,7 +74,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
     yield from discretisation_shift_sentences(result)
     if failed:
-        said = "the fit failed, so do not use the values: they are the best that were reached, without a known ±"
+        said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
         yield SummaryStatement(said, "verdict")
     else:
         texts = *_found_and_lost(free), unused_efforts_sentence(result)
@@ -120,18 +120,18 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f". A guess without a model gives {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})" if best else ""
-        text = f"{group}: the rms error is {sizes[0]} on held-out and {sizes[1]} on fitted recordings. "
+        guess = f" A guess without a model gives {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})." if best else ""
+        text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
         if noise is None or error is None or fitted is None:
             continue
         is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
         if not result["fit"]["explains"]:
-            yield f"{text}Noise alone gives {sizes[2]}{guess}"
+            yield f"{text} Noise alone gives {sizes[2]}.{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
-            advice = "run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'"
-            yield f"{text}Noise alone gives {sizes[2]}, so there is a gap: {advice}{guess}"
+            advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
+            yield f"{text} Noise alone gives {sizes[2]}, less than half, so there is a gap. {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text}Torque noise of the stated size gives {sizes[2]}, so there is no gap{guess}"
+            yield f"{text} Torque noise of the stated size gives {sizes[2]}, so there is no gap.{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -164,9 +164,9 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
-    yield from (f"held-out recording {name} could not be predicted: {why}" for name, why in failed)
+    yield from (f"Held-out recording '{name}' could not be predicted: {why}." for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"the column 'without a model' has errors of guesses, for comparison: {legend}" if legend else ""
+    yield f"The column 'without a model' has errors of guesses, for comparison: {legend}." if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -186,18 +186,18 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
-        yield f"{text} (near zero: of a typical value): {abbreviated_names_text(found)}"
+        yield f"{text} (near zero: of a typical value): {abbreviated_names_text(found)}."
     if lost:
-        yield f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {abbreviated_names_text(lost)}"
+        yield f"These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
     if weak:
-        yield f"only {VERDICT_TABLE_TEXTS['weak']}, so use the 95 % interval: {abbreviated_names_text(weak)}"
+        yield f"These parameters are only weakly determined, so use the 95 % interval: {abbreviated_names_text(weak)}."
         if any(free[name]["interval"] is None for name in weak):
-            yield "`yid-ocp identifiability FILE --intervals all` computes intervals of weak parameters more exactly"
+            yield "`yid-ocp identifiability FILE --intervals all` computes intervals of weak parameters more exactly."
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}"
-                remedy = f"Widen `parameters.{name}.bounds`, or fix {name} there if the bound is a physical limit"
+                remedy = f"Widen parameters.{name}.bounds, or fix {name} there if the bound is a physical limit."
                 yield f"{what}, so values beyond it were not tried. {remedy}"
 
 
@@ -205,7 +205,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
-        said = f"{result['status']}: {result['message']}; without estimates there is nothing to analyse"
+        said = f"There is nothing to analyse, because the fit ended as {result['status']}: {result['message']}."
         yield SummaryStatement(said, "verdict")
         return
     unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
@@ -223,11 +223,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from hidden[:_MAX_DIRECTIONS]
-    yield "to find each, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)" if hidden else ""
+    yield "To find each, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
-        yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)"
+        yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if not result["profiles"]:
-        yield "for exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all"
+        yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]", "note")]
@@ -236,15 +236,15 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
         yield SummaryTable(rows, "What another experiment would identify")
-        said = "no set of up to three changes makes it possible to find all parameters"
+        said = "No set of up to three changes makes it possible to find all parameters."
         if asked["smallest"]:
-            said = f"fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}"
+            said = f"All parameters can be found with these changes, the fewest: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"found only with known start and grasps: {', '.join(lost)}" if lost else "", "verdict")
+    yield SummaryStatement(f"To find {', '.join(lost)}, start and grasps must be known." if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -265,14 +265,14 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         constants.append((joint, *(known.get(constant, "") for constant in heads)))
     yield SummaryTable(constants, f"Friction by the law '{best}'")
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    said = f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {lost}"
+    said = f"These recordings do not determine the following parameters: {lost}."
     yield SummaryStatement(said if lost else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     joints = abbreviated_names_text(result["joints"])
-    text = f"{joints}: use the law '{best}', the simplest one whose held-out error is within one standard error of the "
-    text += f"smallest. Each kind of motion was held out in turn: {', '.join(result['kinds'])}"
+    text = f"For {joints}, use the law '{best}', the simplest one whose held-out error is within one standard error of "
+    text += f"the smallest. Each kind of motion was held out in turn: {', '.join(result['kinds'])}."
     yield SummaryStatement(text, "conclusion")
     if not result["to_use"]:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
@@ -294,23 +294,23 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["error"] is None or result["swing"] is None:
-        yield "do not use this motion: the model cannot simulate it to its end"
+        yield "Do not use this motion, because the model cannot simulate it to its end."
         return
     place = ", ".join(f"{x:.4g}" for x in result["place"])
     yield (
-        f"in {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
+        f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
         f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s, and no point of the "
-        f"object is then faster than {1e3 * result['swing']:.3g} mm/s"
+        f"object is then faster than {1e3 * result['swing']:.3g} mm/s."
     )
     if result["off_path"] is not None:
-        yield f"during the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints"
+        yield f"During the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints."
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        yield f"uncertain parameters make this position uncertain by ({std}) mm in x, y, z (one standard deviation)"
+        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z (one standard deviation)."
         if lost := result["from"]["uncertainty_unknown"]:
-            yield f"parameters that this ignores, because their uncertainty is unknown: {', '.join(lost)}"
+            yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
-        yield "the uncertainty of the position is unknown; for it, set plan.parameter_run_folder to a `solve` run"
+        yield "The uncertainty of the position is unknown. For it, set plan.parameter_run_folder to a `solve` run."
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -327,15 +327,15 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f" ({len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat)" if len(gains) > 1 else ""
-    more = f"the search raised its information by {best['value'] - best['first']:.3g} nat{others}"
-    yield f"random start {result['best'] + 1} of {len(starts)} led to the most informative motion: {more}"
+    more = f"The search raised its information by {best['value'] - best['first']:.3g} nat{others}."
+    yield f"Random start {result['best'] + 1} of {len(starts)} led to the most informative motion. {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"limits that the motion reaches: {'; '.join(reached)}" if reached else "the motion reaches no limit"
-    yield from (f"{n}: no sensor observes it in any motion (to first order); {w}" for n, w in result["unseen"].items())
+    yield f"The motion reaches these limits: {'; '.join(reached)}." if reached else "The motion reaches no limit."
+    yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (f"not determined by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
+    yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
-        yield "the information was computed with the parameters of the configuration; other true values change it"
+        yield "The information was computed with the parameters of the configuration. Other true values change it."
 
 
 @register_summary("yid-check/1")
@@ -353,7 +353,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
             rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
         rest = entry.get("equilibrium")
-        said = [] if rest is None else ["equilibrium found" if rest["found"] else f"no equilibrium: {rest['message']}"]
+        said = [] if rest is None else ["an equilibrium was found" if rest["found"] else rest["message"]]
         gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
         said += ["grasps are open by " + ", ".join(gaps)] if gaps else []
         rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
@@ -368,13 +368,13 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
-    yield "test of links and time steps at the initial values (`solve` repeats it at its estimates):" if moved else ""
+    yield "Test of links and time steps at the initial values (`solve` repeats it at its estimates):" if moved else ""
     yield from moved
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
-    ended = "no problem found: a run is possible"
+    ended = "No problem was found, so a run is possible."
     if result.get("issues") or result["warnings"]:
-        ended = f"a run is possible; see the {'issues' if result.get('issues') else 'warnings'} above"
+        ended = f"A run is possible, but read the {'issues' if result.get('issues') else 'warnings'} above."
     yield SummaryStatement(ended, "conclusion")
 
 
@@ -400,15 +400,15 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "equations: those of a step that contain the parameter; observed: those that influence a sensor. [std]: change "
-        f"per unit of the parameter, in stds of noise: one reading from equilibrium ({seconds:.2g} s), all readings"
+        "Equations: those of a step that contain the parameter. Observed: those that influence a sensor. [std]: change "
+        f"per unit of the parameter, in stds of noise, in one reading from equilibrium ({seconds:.2g} s) or all."
     )
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"and {left} more free parameters, in result.json" if left > 0 else ""
+    yield f"{left} more free parameters are in result.json." if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "the column 'observed' is left out, because it can be computed only at an equilibrium"
-    said = f"linearised at {linear['at']}: the spectral radius of A is {linear['spectral_radius']:.6g}"
+        yield "The column 'observed' is left out, because it can be computed only at an equilibrium."
+    said = f"The spectral radius of A, linearised at {linear['at']}, is {linear['spectral_radius']:.6g}."
     yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
@@ -479,11 +479,11 @@ def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @register_summary("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
-        yield SummaryStatement(f"failed: {result['message']}", "verdict")
+        yield SummaryStatement(f"The simulation failed: {result['message']}", "verdict")
     else:
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group", "samples"), *rows], "Recorded", is_key_table=True)
-        yield SummaryStatement(f"{result['duration']:g} s in recording.h5", "verdict")
+        yield SummaryStatement(f"The file recording.h5 has {result['duration']:g} s of motion.", "verdict")
 
 
 @register_summary("yid-track/1")
@@ -499,7 +499,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used; the fit of one took {spent:.0f} ms"
+    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used. One fit took {spent:.0f} ms."
     yield SummaryStatement(said, "verdict")
     yield from (f"{count_with_noun(n, 'frame')} left out: {reason}" for reason, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
@@ -523,7 +523,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate is None:
         return
     if gate["status"] != "done":
-        yield f"the file is written, but was not tested by a replay in MuJoCo: {gate['reason']}"
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}"
         return
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
@@ -532,4 +532,4 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows)
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-        yield f"replay in MuJoCo of {held}: error beyond noise {100 * gate['fall']:.3g} % below that of `nominal`"
+        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % below that of `nominal`."

@@ -122,9 +122,9 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
-        yield SummaryStatement(f"no value counts as found until this is corrected: {'; '.join(severe)}", "verdict")
+        yield SummaryStatement(f"No value counts as found until this is corrected: {'; '.join(severe)}.", "verdict")
     if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
-        yield f"these issues change no verdict, so values may be used once their causes are clear: {'; '.join(mild)}"
+        yield f"These issues change no verdict, so values may be used once their causes are clear: {'; '.join(mild)}."
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -139,7 +139,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
         stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
-        yield f"to use these numbers ({stated}):"
+        yield f"To use these numbers, copy the lines below ({stated}):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))
 
@@ -165,15 +165,16 @@ def misfit_summary_blocks(
                     )
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "do not use the values: with the model error in its ±, none is known to within 10 %"
-            said = f"use these values only if `yid-ocp diagnose` finds no effect (± includes the model error): {shown}"
+            none = "Do not use the values, because none is known to within 10 % if ± includes the model error."
+            said = f"Use these values only if `yid-ocp diagnose` finds no effect (± includes the model error): {shown}."
             yield SummaryStatement(said if known else none, "conclusion")
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
-    yield SummaryStatement(f"worse than a guess without a model (rms): {'; '.join(texts)}" if texts else "", "verdict")
+    said = f"The rms error of these channels is larger than that of a guess without a model: {'; '.join(texts)}."
+    yield SummaryStatement(said if texts else "", "verdict")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
@@ -187,10 +188,10 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
-            text = f"with {words}, estimates change by more than their ± from the data (remedy: {remedy}): "
-            said.append(text + abbreviated_names_text(changes, _MAX_SHIFTS))
+            text = f"With {words}, these estimates change by more than their ± from the data: "
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The remedy is {remedy}.")
         elif tried:
-            said.append(f"with {words}, no estimate changes by more than its ± from the data")
+            said.append(f"With {words}, no estimate changes by more than its ± from the data.")
     return said
 
 

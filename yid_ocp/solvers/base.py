@@ -562,7 +562,7 @@ class _RelinearizingSearch:
             x, self.evaluation = found.x, found.evaluation or now
         self.evaluation = self.weighted.evaluate(x, equilibrium_guesses=guesses)
         status = Status.CONVERGED if length < 10 * _LAST_STEP_STDS else Status.ITERATION_LIMIT
-        return ended(status, f"steps of {length:.2g} standard deviations after {_MAX_LINEARIZATIONS} linearizations")
+        return ended(status, f"a step of {length:.2g} standard deviations ended {_MAX_LINEARIZATIONS} linearizations")
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:

@@ -288,7 +288,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
-                    return ended(base.Status.STALLED, "no step along the gradient lowers the cost")
+                    return ended(base.Status.STALLED, "no step along the gradient lowers the cost; try gauss_newton")
             moved, before, x = trial - x, gradient, trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
             length /= self.backtracking_factor

@@ -109,15 +109,13 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             return self._by_condensing(problem, start, base.AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
-            hint = "set hessian: gauss_newton"
-            told = f"hessian = '{self.hessian}'", "hessian", "gauss_newton, exact", hint
+            told = f"there is no Hessian '{self.hessian}'", "hessian", "gauss_newton, exact", "use gauss_newton"
         elif str(self.ipopt_options.get("hessian_approximation", "exact")) != "exact":
-            what = "a limited-memory Hessian is not supported: it is too slow for thousands of node states"
-            hint = "remove the option, and set hessian: gauss_newton"
-            told = what, "ipopt_options.hessian_approximation", "exact", hint
+            what = "a limited-memory Hessian is not supported, because it is too slow for thousands of node states"
+            told = what, "ipopt_options.hessian_approximation", "exact", "remove it, and set hessian: gauss_newton"
         elif self.node_interval not in (None, 1):
-            hint = "set condensing: true, or node_interval: 1"
-            told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
+            what = f"node_interval is {self.node_interval}, but must be 1 without condensing"
+            told = what, "node_interval", "1", "set condensing: true, or node_interval: 1"
         if told:
             raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
         return self._by_ipopt(problem, start, base.AcceptedIterateRecorder(callback))
@@ -133,7 +131,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
-            message = f"{size}, of which {free / 1e9:.2g} GB are free; set a longer time_step, a shorter duration, or "
+            message = f"{size}, but only {free / 1e9:.2g} GB are free; set a longer time_step, a shorter duration, or "
             return recorder.solver_result_with_iterates(base.Status.FAILED, message + "gauss_newton", start)
         functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
         watch = _Watch(problem, program, functions, ridge, recorder)
@@ -166,13 +164,13 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[base.Status, str]:
-        closed = f"largest defect {defect:.1e}"
+        closed = f"with a largest defect of {defect:.1e}"
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-            return base.Status.CONVERGED, f"IPOPT: {returned}, {closed}"
+            return base.Status.CONVERGED, f"IPOPT ended as {returned}, {closed}"
         if returned == "Maximum_Iterations_Exceeded":
             limit = f"IPOPT stopped after {self.max_iterations} iterations, {closed}"
             return base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return base.Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer to the solution, or use gauss_newton"
+        return base.Status.STALLED, f"IPOPT ended as {returned}, {closed}; start nearer, or use gauss_newton"
 
     def _by_condensing(
         self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
@@ -204,7 +202,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
                 if now.defect < _CLOSED_DEFECT:
-                    return ended(base.Status.CONVERGED, f"largest defect {now.defect:.1e}")
+                    return ended(base.Status.CONVERGED, f"the largest defect is {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
@@ -224,8 +222,8 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
                     return ended(base.Status.STALLED, f"{reason}; set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        limit = f"no convergence in {self.max_iterations} iterations, largest defect {now.defect:.1e}"
-        return ended(base.Status.ITERATION_LIMIT, limit)
+        limit = f"no convergence in {self.max_iterations} iterations (the largest defect is {now.defect:.1e})"
+        return ended(base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations")
 
 
 class _AdaptiveRidge(ca.Callback):
@@ -343,8 +341,9 @@ class _ShootingIntervals:
         for episode in problem.episodes:
             steps = episode.grid.steps
             if steps < node_interval:
-                what = f"recording '{episode.name}' has {steps} steps, fewer than a node interval of {node_interval}"
-                raise SolverError(what, where="solver.node_interval", allowed=f"1 to {steps} time steps")
+                what = f"the node interval is {node_interval} steps, but recording '{episode.name}' has only {steps}"
+                hint, allowed = f"set solver.node_interval: {steps} or less", f"1 to {steps} time steps"
+                raise SolverError(what, where="solver.node_interval", allowed=allowed, hint=hint)
             if any(s.sensor.effort_joints for s in episode.measurements):
                 message = "multiple shooting with condensing cannot use measured efforts of prescribed joints"
                 where, allowed = f"recording '{episode.name}': joints/effort", "measurements that depend on node states"
@@ -420,7 +419,7 @@ class _ShootingIntervals:
         for j, (first, last) in enumerate(zip(self.node_steps[i][:-1], self.node_steps[i][1:], strict=True)):
             rollout = self._rollout(i, j, nodes[j], theta, SensitivityDirections(wanted, by_nodes[j]))
             if not rollout.status.is_converged or rollout.state_sensitivity is None:
-                return f"{self.problem.episodes[i].name}: interval {j}: {rollout.status.message}"
+                return f"in interval {j} of '{self.problem.episodes[i].name}', {rollout.status.message}"
             trajectory[first:last], slopes[first:last] = rollout.state[:-1], rollout.state_sensitivity[:-1]
             gaps[j + 1] = rollout.state[-1] - nodes[j + 1]
             by_nodes[j + 1] = rollout.state_sensitivity[-1]

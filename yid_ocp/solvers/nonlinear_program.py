@@ -338,7 +338,7 @@ class NonlinearProgram(ReprMixin):
         if len(alike) == 1:
             return blocks[alike[0]]
         said = unknown_name_error_arguments(name, alike or blocks)
-        what = f"'{name}' is ambiguous" if alike else f"the program has no block '{name}'"
+        what = f"'{name}' names {len(alike)} blocks of the program" if alike else f"the program has no block '{name}'"
         raise SolverError(what, where=f"nlp['{name}']", **said)
 
     def __getitem__(self, name: str) -> ca.MX:
@@ -521,8 +521,9 @@ class NonlinearProgram(ReprMixin):
         for name, side in (("lower", lower), ("upper", upper)):
             given = np.asarray(side, float).ravel()
             if given.size not in (1, column.numel()):
-                message = f"{given.size} {name} bounds for {column.numel()} constraints"
-                raise SolverError(message, where=f"{where}: {name}", allowed=f"1 or {column.numel()} bounds")
+                message = f"{given.size} {name} bounds are given for {column.numel()} constraints"
+                allowed, hint = f"1 or {column.numel()} bounds", f"pass one number or {column.numel()} as {name}"
+                raise SolverError(message, where=f"{where}: {name}", allowed=allowed, hint=hint)
             bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
         return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 

@@ -98,9 +98,9 @@ def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> No
     neutral = problem.predictor.are_input_corrections_neutral_and_fixed
     if not all(neutral(episode, problem.theta) for episode in problem.episodes):
         names = ", ".join(f"{effect.kind}@{effect.location}" for effect in problem.system.effects)
-        message = f"an effect changes recorded inputs, times or the reference of the tracking filter (one of {names})"
+        message = f"{where} cannot handle an effect that changes recorded inputs, times or the tracking filter"
         allowed, hint = "effects on mechanics or sensor readings", "set solver.name: gauss_newton, or remove the effect"
-        raise SolverError(message, where=where, allowed=allowed, hint=hint)
+        raise SolverError(message, where=f"one of the effects {names}", allowed=allowed, hint=hint)
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:

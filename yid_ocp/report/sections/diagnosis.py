@@ -69,7 +69,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             values["noise alone"] = (factor * floor[channel], None)
         rows.append((channel, shown, values))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = ["Errors on held-out recordings by channel, with the error from noise alone."]
+    sentences = ["The figure has the errors on held-out recordings by channel, with the error from noise alone."]
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
@@ -98,28 +98,23 @@ def _figures_by_model(
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
+    from yid_ocp.diagnosis.sentences import GAP_ORIGIN_TEXTS  # other commands need none of it
+
     smoothed = finding.smoother_result
     if smoothed is None:
         return None
     noticed = ", ".join(place.location for place in finding.gap_locations if place.is_observable)
     silent = ", ".join(place.location for place in finding.gap_locations if not place.is_observable)
-    verdicts = {
-        "plant": "the mechanics, not what sensors read",
-        "sensor": "what sensors read, not the mechanics",
-        "both": "both the mechanics and what sensors read",
-        "either": "the mechanics or what the effort sensors read (efforts alone cannot distinguish them)",
-        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can show",
-    }
-    evidence = smoothed.log_evidence
+    evidence, origin = smoothed.log_evidence, GAP_ORIGIN_TEXTS[smoothed.plant_or_sensor_origin]
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
-    without = ", without the effects that explain the gap" if finding.accepted_effects else ""
+    without = " (without the effects that explain the gap)" if finding.accepted_effects else ""
     sentences = [
-        f"Analysis of the {_NOMINAL_LABEL}{without}: every coordinate has an unknown force, every grasp an unknown "
-        "offset and every measured point an unknown bias, which may change over time. The fewest groups of them that "
-        "explain the residual were kept.",
-        f"Most probably the gap lies in {verdicts[smoothed.plant_or_sensor_origin]}: the log evidence rises by "
+        f"The analysis gives every coordinate of the {_NOMINAL_LABEL}{without} an unknown force, every grasp an "
+        "unknown offset and every measured point an unknown bias, which may change over time. It keeps the fewest "
+        "groups of them that explain the residual.",
+        f"Most probably the origin of the gap is {origin}. The log evidence rises by "
         f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
-        f"alone, by {evidence['both']:.4g} with both (5: odds of 150 to 1). They explain "
+        f"alone, by {evidence['both']:.4g} with both; a rise of 5 means odds of 150 to 1. These unknowns explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings.",
         f"A gap at {noticed} would have been detected." if noticed else "",
         f"A gap at {silent} would not have been detected by these motions and sensors." if silent else "",
@@ -158,10 +153,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
-        sentence = (
-            f"Grey: not determined by the data. The most significant value is that of {names[k]}, {edges[j]:.2f} to "
-            f"{edges[j + 1]:.2f} s, {said(j, k)}."
-        )
+        span = f"{edges[j]:.2f} to {edges[j + 1]:.2f} s, {said(j, k)}"
+        sentence = f"Grey cells are not determined. The most significant value is that of {names[k]}, {span}."
     else:
         prior = np.sqrt([smoothed.group_variance[source] for source in groups])
         values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
@@ -187,12 +180,12 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "Points: force or torque beyond the model, estimated from the recording. Grey: error that a correct model has. "
-        "Shaded: windows of events, with their shape as a line. Events are excluded from the results below "
-        "where possible."
+        "Points are the force or torque beyond the model, estimated from the recording. The grey band is the error "
+        "that a correct model has. Shaded windows are events, with their shape as a line. Events are left out of the "
+        "results below where possible."
         if events.force_estimates
         else "",
-        *overspeed_truncation_messages(events),
+        *overspeed_truncation_messages(finding),
     ]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
@@ -232,18 +225,21 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         return None
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     unit = "as a fraction of the error beyond noise" if percent else absolute
-    promise = f"redicted decrease of the misfit on fitted motions by each effect (linear model), {unit}."
+    promise = f"the predicted decrease of the misfit on fitted motions by each effect (linear model), {unit}."
     refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
     why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
     unmeasured = f"Refitted: {refitted}. Held-out motions do not show how much of the gap this closes{why}."
-    sentences = [f"P{promise}", unmeasured if refitted else "No predicted decrease is large enough for a refit."]
+    sentences = [
+        f"Bars show {promise}",
+        unmeasured if refitted else "No predicted decrease is large enough for a refit.",
+    ]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
-            "Left: part of the held-out gap that each effect alone closes, refitted with the parameters, with its 95 % "
-            f"interval. 100 %: no gap is left; below zero: predictions get worse. Values: {said}.",
-            f"Right: p{promise}",
+            "The left part shows how much of the held-out gap each effect alone closes, refitted with the parameters, "
+            f"with 95 % intervals. At 100 % no gap is left; below zero predictions get worse. The values are {said}.",
+            f"The right part shows {promise}",
         ]
     # room for one word on a narrow screen
     axes = ("closed [%]", "promised [%]" if percent else "promised")
@@ -267,9 +263,9 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     rival = law.runner_up
     sentences = [
         law.sentence,
-        "Band: two standard deviations. Dotted lines: range that the recordings cover; beyond it the torque is held "
-        "constant. Dashed: the nearest law of the library.",
-        "" if rival is None else f"Next best: {rival[1]} at {rival[0]}, closes {100 * rival[2]:.3g} % of the gap.",
+        "The band is two standard deviations. Dotted lines bound the range that the recordings cover; beyond it the "
+        "torque is held constant. The dashed line is the nearest law of the library.",
+        f"The next best law, {rival[1]} at {rival[0]}, closes {100 * rival[2]:.3g} % of the gap." if rival else "",
         "law.csv has this table. To use it in a model, add the effect {kind: law, location, depends_on, law_csv}.",
     ]
     return "A torque law for the gap", sentences, shown
@@ -308,9 +304,9 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     none = f"No two signatures are similar in both directions; by the smaller percentage the closest are {said[0][1]}."
     sentences = [
-        "Percentage of the row's signature that the column's effect can reproduce, together with the parameters. "
+        "A cell has the percentage of the row's signature that the column's effect can reproduce, with the parameters. "
         "At 100 %, these motions and sensors cannot distinguish the two effects.",
-        f"Similar in both directions, with the smaller percentage: {listed}." if close else none,
+        f"Similar in both directions are (smaller percentage): {listed}." if close else none,
     ]
     return "Which effects are confusable", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
@@ -348,8 +344,8 @@ def _curves(
     shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
-        f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
-        "each the error, two standard deviations of the sensor noise shaded. A correct model is inside 95 % of the "
+        f"The figures show the {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}. Below each is "
+        "the error, with two standard deviations of the sensor noise shaded. A correct model is inside 95 % of the "
         "time, unless errors of the torques also move the arm."
     ]
     return "Measured and predicted", sentences, shown
@@ -369,8 +365,8 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
-        "Without the effects, free parameters change to imitate them. The figure shows this change. Bars: two standard "
-        "deviations, cut at the edge of the figure.",
+        "Without the effects, free parameters change to imitate them. The figure shows this change. Bars are two "
+        "standard deviations, cut at the edge of the figure.",
         f"{said}." if said else "No parameter changes by more than 10 %.",
     ]
     return "Parameters that imitated the effects", sentences, shown
