@@ -113,7 +113,7 @@ def run(
     made = run_tasks(make_member, tasks, out / "made", workers, print_progress, maker)
     lost = [entry for entry in made if entry.error]
     if lost:
-        raise ModelError(f"{lost[0].name} failed: {lost[0].error}")
+        raise ModelError(f"{lost[0].name} failed: {lost[0].error}", hint="choose another seed")
     tasks = [
         Task(
             f"solution {k} of {experiment}, {errors}",

@@ -17,19 +17,18 @@ class YidError(Exception):
     """
 
     _usual_allowed = "what docs/reference and docs/howto describe"
-    _usual_hint = "change what `where` names so that it agrees with `allowed`"
 
-    def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
+    def __init__(self, what: str, *, hint: str, where: str = "", allowed: str = "") -> None:
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
         super().__init__(what)
 
     def message_parts(self) -> dict[str, str]:
-        """Return the four parts of the message (what, where, allowed, hint). A general text replaces a missing part."""
+        """Return the four parts of the message (what, where, allowed, hint). A general text replaces a missing place or range."""
         said = {
             "what": self.what,
             "where": self.where or "the arguments of this command or function",
             "allowed": self.allowed or self._usual_allowed,
-            "hint": self.hint or self._usual_hint,
+            "hint": self.hint,
         }
         shown = {
             key: "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
@@ -100,7 +99,6 @@ class OutputError(YidError):
     """An error that is raised when a result cannot be written to its destination."""
 
     _usual_allowed = "a path in a writable folder, on a disk with free space"
-    _usual_hint = "choose another path"
 
 
 class ParallelWorkError(YidError):

@@ -194,7 +194,7 @@ def test_springs_need_a_marker_off_the_axis_or_the_joint(springs):
 
 
 def missing(*arguments, **settings):
-    raise DataError("MuJoCo is not installed")
+    raise DataError("MuJoCo is not installed", hint="")
 
 
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):

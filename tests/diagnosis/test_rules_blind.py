@@ -75,7 +75,7 @@ def drawn(monkeypatch):
         made.append(vars(settings) | {"system": of, "truth": dict(truth), "injected": tuple(injected)})
         made[-1]["friction"] = friction
         if len(made) <= build.failures:
-            raise ModelError("it flies away")
+            raise ModelError("it flies away", hint="")
         return Recording(points=(PointGroup("p", ("tip",), np.array([0.0]), np.zeros((1, 1, 3))),), description="told")
 
     def multisine(of, truth, **settings):

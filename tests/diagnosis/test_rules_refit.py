@@ -266,7 +266,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
 
 def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
     def snap(problem, base, values):
-        raise SolverError("it snaps", where="model")
+        raise SolverError("it snaps", where="model", hint="")
 
     monkeypatch.setattr(module, "screen_candidates", snap)
     search = RefitContext(TWO_RECORDINGS, LIMITS, Heard())

@@ -107,7 +107,7 @@ def test_a_model_that_is_right_has_no_gap(bench):
 
 @pytest.mark.usefixtures("without_law")
 def test_a_model_that_fails_with_all_candidates_is_diagnosed_at_a_shorter_step(bench, monkeypatch):
-    real, failures = diagnose_module.screen_candidates, [SolverError("it fails")] * 2
+    real, failures = diagnose_module.screen_candidates, [SolverError("it fails", hint="")] * 2
 
     def screen(*arguments):
         if failures:

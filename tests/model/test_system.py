@@ -212,7 +212,7 @@ def test_an_error_has_its_parts_on_lines_of_their_own():
     assert str(error) == "it broke\n  where: here\n  allowed: this\n  try: that"
     assert isinstance(error, YidError)
     assert (error.what, error.where, error.allowed, error.hint) == ("it broke", "here", "this", "that")
-    lines = str(ModelError("it broke")).splitlines()
+    lines = str(ModelError("it broke", hint="mend it")).splitlines()
     assert [line.split(":")[0] for line in lines] == ["it broke", "  where", "  allowed", "  try"]
 
 

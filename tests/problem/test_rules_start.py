@@ -319,7 +319,7 @@ def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, whi
     [(_, held)] = problem.predict_held_out(problem.initial_unknowns)
     np.testing.assert_allclose(held.rollout.state[0], states[which - 1], atol=1e-6)
     if which == 2:  # its mirror image is tried, too, where no shape can be fitted; and it stays with other stiffnesses
-        fitted = Mock(side_effect=DataError("no shape"))
+        fitted = Mock(side_effect=DataError("no shape", hint=""))
         monkeypatch.setattr(InitialStateFitter, "fit_initial_state_to_points", fitted)
         assert np.ptp(rod_problem(step, states[1]).episodes[0].equilibrium_guess - states[1][:11]) < 1e-6
         assert [int(samples.node[0]) for samples in fitted.call_args.args[1]] == [0]  # where the prescribed path begins

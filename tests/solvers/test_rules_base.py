@@ -593,7 +593,7 @@ def test_a_horizon_too_short_for_a_filter_is_left_out():
 
     def shortened(options):
         if options.duration < 2.0:
-            raise DataError("0.6 s of efforts are too short for a low-pass filter of 8 Hz")
+            raise DataError("0.6 s of efforts are too short for a low-pass filter of 8 Hz", hint="")
         return prepared(options)
 
     problem.with_options = shortened
@@ -607,7 +607,7 @@ def test_another_start_that_cannot_even_begin_loses_nothing():
     class Fragile(Steps):
         def minimize_cost(self, problem, start, callback):
             if start[0] > 3.0:
-                raise SolverError("no transcription from here")
+                raise SolverError("no transcription from here", hint="")
             return super().minimize_cost(problem, start, callback)
 
     problem = MadeUp(lambda x, duration: (9.0 * (-1.0) ** np.arange(10), np.ones((10, 1))))

@@ -457,7 +457,7 @@ class RunSettings:
                 return f"{self.key_locations[path[:count]]}: {key}"
         return f"{self.config_file}: {key}" if self.config_file else key
 
-    def config_error(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
+    def config_error(self, what: str, *path: str | int, hint: str, allowed: str = "") -> ConfigError:
         """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""
         return ConfigError(what, where=self.setting_location(*path), allowed=allowed, hint=hint)
 
