@@ -143,13 +143,9 @@ def test_injected_pushes_of_a_real_double_pendulum_are_found(events):
     assert score.apart >= 3
 
 
-@pytest.fixture(scope="module")
-def alarms(benchmark_module, coverage):
-    return benchmark_module("false_alarms", coverage=coverage)
-
-
 @pytest.mark.slow
-def test_noise_is_no_gap_and_an_offset_beyond_what_is_stated_is_named(alarms, tmp_path):
+def test_noise_is_no_gap_and_an_offset_beyond_what_is_stated_is_named(benchmark_module, coverage, tmp_path):
+    alarms = benchmark_module("false_alarms", coverage=coverage)
     workers = WorkerConfig(n_processes=2)
     made = alarms.record(["one_arm_encoders", "offset_beyond"], 1, workers, tmp_path)
     twins = alarms.diagnosed(made, "[kelvin_voigt, joint_viscous, effort_offset]", workers, tmp_path)

@@ -437,12 +437,6 @@ def noisy(repository):
     return load_problem(repository / "configs" / "single_arm_vision.yaml", coarse)
 
 
-def half_without(problem, *groups):
-    """Half a second of a problem without some sensors."""
-    sensors = {**problem.options.sensors, **{name: SensorOptions(use=False) for name in groups}}
-    return problem.with_options(replace(problem.options, sensors=sensors, duration=0.5))
-
-
 def relative(problem):
     return {name: entry.std_relative for name, entry in identifiability(problem).parameters.items()}
 
@@ -460,7 +454,10 @@ def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy, ranking):
 
 
 def test_encoders_that_are_measurements_stay_so(noisy):
-    problem, without = (half_without(noisy, "points_arm", *more) for more in ((), ("joints.position",)))
+    half, off = replace(noisy.options, duration=0.5), SensorOptions(use=False)
+    arms = half.sensors | {"points_arm": off}
+    sensors = (arms, arms | {"joints.position": off})
+    problem, without = (noisy.with_options(replace(half, sensors=own)) for own in sensors)
     found, blind = (what_if(one, considered_changes=()).unchanged_experiment.std_relative for one in (problem, without))
     for name, std in relative(problem).items():
         assert found[name] == pytest.approx(std, rel=0.3)

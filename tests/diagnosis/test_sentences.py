@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -183,13 +182,6 @@ def compared():
         yield f"{name} with effects", finding(counterfactual=CounterfactualPredictionErrors(better, other))
 
 
-def separating(rivals: Mapping[str, str]) -> str:
-    """The experiment that separates effects, given by label with what they depend on."""
-    alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
-    chosen = (SimpleNamespace(equivalent_effects=alike),)
-    return recommended_experiment_text(SimpleNamespace(accepted_selected_effects=chosen))
-
-
 def said() -> dict[str, str]:
     """Every text by its case."""
     found = {
@@ -211,7 +203,9 @@ def said() -> dict[str, str]:
         {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED},
         {"melting@T1": "how hot it is", "density@T1": ACCELERATION},
     ]:  # fmt: skip
-        found[f"next experiment: rivals {list(rivals)}"] = separating(rivals)
+        alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
+        made = SimpleNamespace(accepted_selected_effects=(SimpleNamespace(equivalent_effects=alike),))
+        found[f"next experiment: rivals {list(rivals)}"] = recommended_experiment_text(made)
     force = ForceOrFaultEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
     odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
     for events in ((force,), (force, odd), (force,) * 14):

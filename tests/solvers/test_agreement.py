@@ -79,18 +79,14 @@ def test_gauss_newton_recovers_the_truth_of_another_engine(make_problem, recordi
     assert verdicts["T2.twist"] == verdicts["T3.twist"] == "not_identifiable"
 
 
-@pytest.fixture(scope="module")
-def one_link_tubes(paper_systems, recording):
-    """The arm with tubes of one link each: 16 coordinates in place of 43."""
+def test_multiple_shooting_with_a_node_at_every_step_agrees(paper_systems, recording):
+    """Of an arm with tubes of one link each: 16 coordinates in place of 43."""
     arm = paper_systems["single"]
     robot, objects = read_urdf("package:baxter", joints=arm.driven), [(foam_y_object(links=1), None, None)]
     system = System.build(robot, objects=objects, grasps=arm.grasps, driven=arm.driven, damping=0.05)
     step, options = compile_step(system, 0.01), ProblemOptions(duration=0.5)
-    return EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), options)
-
-
-def test_multiple_shooting_with_a_node_at_every_step_agrees(one_link_tubes):
-    single, solution = (fit_problem(one_link_tubes, solver) for solver in (GaussNewton(), MultipleShooting()))
+    problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), options)
+    single, solution = (fit_problem(problem, solver) for solver in (GaussNewton(), MultipleShooting()))
     assert solution.status == Status.CONVERGED, solution.message
     assert within(solution, single, 0.01)
     assert solution.cost == pytest.approx(single.cost, rel=1e-6)

@@ -440,14 +440,9 @@ def ringing(x, horizon):
     return (swing(k) - swing(TRUE)) / NOISE, slope[:, None] / NOISE
 
 
-def ringing_problem(start):
-    problem = MadeUp(ringing, [start], duration=2.0)
-    problem.has_process_noise = True
-    return problem
-
-
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):
-    problem = ringing_problem(1.3)
+    problem = MadeUp(ringing, [1.3], duration=2.0)
+    problem.has_process_noise = True
     monkeypatch.setattr(base, "problem_with_whitening_at", lambda problem, x, *_, **how: problem)
     # no other reason to start again
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)

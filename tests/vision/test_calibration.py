@@ -82,14 +82,6 @@ def clouds(robot, times, rng, motion=lively, scale=1.0, pose=POSE):
     return found
 
 
-def told_pose(turn, shift, rng):
-    pose = POSE.copy()
-    axis, way = rng.standard_normal((2, 3))
-    pose[:3, :3] = Rotation.from_rotvec(math.radians(turn) * axis / np.linalg.norm(axis)).as_matrix() @ POSE[:3, :3]
-    pose[:3, 3] += shift * way / np.linalg.norm(way)
-    return pose
-
-
 def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=0.0, duration=4.0, frames=6, **options):
     """A calibration, and the true state."""
     rng = np.random.default_rng(seed)
@@ -98,7 +90,9 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     stamps = times + latency + drift * times + options.pop("late", np.zeros(frames))
     seen = list(map(StampedCloud, stamps.tolist(), clouds(robot, times, rng, motion, scale)))
     clock = options.pop("clock", CameraClockOptions())
-    pose = told_pose(turn, shift, rng)
+    pose, (axis, way) = POSE.copy(), rng.standard_normal((2, 3))
+    pose[:3, :3] = Rotation.from_rotvec(math.radians(turn) * axis / np.linalg.norm(axis)).as_matrix() @ POSE[:3, :3]
+    pose[:3, 3] += shift * way / np.linalg.norm(way)
     found = calibration.calibrate_camera(
         arm_of(robot, motion), seen, pose, rng, ArmBasedCameraCalibrationOptions(**options), clock
     )

@@ -167,15 +167,12 @@ def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeyp
     assert "a10@x" not in said
 
 
-def fake_problem(*names: str) -> SimpleNamespace:
-    parameters = {name: SimpleNamespace(unit="N m/rad") for name in names}
-    return SimpleNamespace(shared_parameters=names, system=SimpleNamespace(parameters=parameters))
-
-
 def test_a_live_fit_shows_cost_and_the_courses_of_parameters_those_that_move_first(tmp_path):
     heard, folder = Heard(), SimpleNamespace(log_event=lambda *_, **__: None)
+    known = dict.fromkeys(("still", "moving"), SimpleNamespace(unit="N m/rad"))
+    problem = SimpleNamespace(shared_parameters=tuple(known), system=SimpleNamespace(parameters=known))
     for is_live in (False, True):
-        iterate = _iterate_logger(fake_problem("still", "moving"), folder, heard, is_live)
+        iterate = _iterate_logger(problem, folder, heard, is_live)
         for k, (cost, value) in enumerate([(100.0, 1.0), (10.0, 4.0), (1.0, 5.0)]):
             iterate(replace(ENTRY, iteration=k, cost=cost, x=np.array([2.0, value, 99.0])))
         if not is_live:
