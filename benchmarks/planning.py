@@ -150,16 +150,16 @@ class Servo:
         self._joints, self._first = np.zeros(0, int), np.zeros(0)
         self._kept: tuple[float, Array, Array | None] | None = None
 
-    def prepare(self, model: Any) -> None:
+    def edit_model(self, model: Any) -> None:
         """Find the joints' addresses; damping is the model's own, which the simulator integrates implicitly."""
         self._joints = np.array([model.joint(name).id for name in self._movement.joints])
         model.dof_damping[self._joints] += self.DAMPING
 
-    def begin(self, data: Any) -> None:
+    def begin_motion(self, data: Any) -> None:
         """Take the posture at rest as where the motion begins."""
         self._first, self._kept = data.qpos[self._joints].copy(), (-1.0, np.zeros((3, len(self._joints))), None)
 
-    def force(self, _: Any, data: Any) -> None:
+    def add_forces(self, _: Any, data: Any) -> None:
         """Pull towards the planned angles."""
         # the clock of the controller's own model, which is asked for torques, stands still
         t = float(data.time)
