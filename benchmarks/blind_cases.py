@@ -27,9 +27,8 @@ CONFIGS = Path(__file__).resolve().parents[1] / "yid_ocp" / "data" / "defaults"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Diagnose cases of one experiment of a blind ensemble.")
-    parser.add_argument(
-        "experiment", nargs="?", default="diagnosis.bare_arm_efforts", help=", ".join(EXPERIMENT_VARIATIONS)
-    )
+    what = f"CONFIG.VARIATION; variations: {', '.join(EXPERIMENT_VARIATIONS)}"
+    parser.add_argument("experiment", nargs="?", default="diagnosis.bare_arm_efforts", help=what)
     parser.add_argument("--category", default="null", choices=list(BLIND_CASE_CATEGORY_SHARES))
     parser.add_argument("--multiple", type=float, help="of the detectable size of one effect")
     parser.add_argument("--brisk", action="store_true", help="three times the acceleration")

@@ -225,7 +225,9 @@ def main() -> None:
     parser.add_argument("what", choices=("parameter", "pair", "wrist"))
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--recordings", type=int, default=5)
-    parser.add_argument("--case", default="heavy_free_branch", help="of diagnosis_cases.py")
+    parser.add_argument(
+        "--case", default="heavy_free_branch", choices=CASES, metavar="CASE", help="see diagnosis_cases.py"
+    )
     parser.add_argument("--share", type=float, default=1.0, help="part of the case's size")
     arguments = parser.parse_args()
     if arguments.what == "parameter":

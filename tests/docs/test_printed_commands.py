@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import runpy
 import shlex
 import shutil
+import subprocess
+import sys
+from argparse import ArgumentParser
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,9 +47,16 @@ UNFINISHED = ("solve configs/servo_arm.yaml", "solve cable.yaml")
 PROGRAMS = ("README", "export", "experiment", "workers", "import_formats", "recordings")
 """Pages with a program in Python that the slow tests run after the page's commands."""
 REPOSITORY = Path(__file__).resolve().parents[2]
-PAGES = {p: p.read_text("utf-8") for p in (REPOSITORY / "README.md", *sorted(REPOSITORY.glob("docs/**/*.md")))}
+FILES = (REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted(REPOSITORY.glob("docs/**/*.md")))
+PAGES = {p: p.read_text("utf-8") for p in FILES}
 PRINTED = {p: found for p, text in PAGES.items() if (found := printed_commands(text)) or p.stem == "recordings"}
 PARSER = build_argument_parser()
+SCRIPT = re.compile(r"(`)?python\s+((?:benchmarks|docs)/(?(1)[^`]+|[^#\n]+))")
+"""Command of a script beside the package, in a sentence or on a line of its own."""
+SCRIPTS = sorted({" ".join(said.split()) for text in PAGES.values() for _, said in SCRIPT.findall(text)})
+STAND_INS = {"NAME ...": "friction", "NAME": "friction", "ROBOT": "1", "CASE": "clean"}
+BRIEF = [said for said in SCRIPTS if re.search(r"torque_noise|wrist$|one_way|--simulated$|--only hands", said)]
+"""Scripts that need less than a minute of CPU time."""
 
 
 def understood(arguments: list[str]) -> None:
@@ -145,3 +157,23 @@ def test_sentences_and_yaml_blocks_are_understood():
         for block in blocks(text, "yaml") if page.stem not in ("settings", "extending") else ():
             said = YAML(typ="safe", pure=True).load(block)
             load_config(None, [f"{section}={json.dumps(value)}" for section, value in said.items()])
+
+
+@pytest.mark.parametrize("said", SCRIPTS)
+def test_printed_scripts_take_their_arguments(said, monkeypatch):
+    script, *words = shlex.split(re.sub("|".join(STAND_INS), lambda word: STAND_INS[word[0]], said))
+    parse = ArgumentParser.parse_args
+    monkeypatch.setattr(ArgumentParser, "parse_args", lambda *given: (parse(*given), sys.exit("understood")))
+    monkeypatch.setattr(Path, "write_text", lambda *_, **__: sys.exit("understood"))  # of a script without arguments
+    monkeypatch.setattr(sys, "argv", [script, *words])
+    monkeypatch.syspath_prepend(REPOSITORY / "benchmarks")
+    monkeypatch.delitem(sys.modules, "coverage", raising=False)  # a benchmark has this name
+    with pytest.raises(SystemExit, match="understood"):
+        runpy.run_path(str(REPOSITORY / script), run_name="__main__")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", BRIEF)
+def test_brief_scripts_run(said, shared):
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    subprocess.run([sys.executable, *shlex.split(said)], cwd=REPOSITORY, env=environment, check=True)
