@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -14,11 +13,8 @@ TRUTH = {"a": 1.0, "b": 2.0}
 
 
 @pytest.fixture(scope="module")
-def table(repository):
-    spec = importlib.util.spec_from_file_location("peers_table", repository / "benchmarks" / "peers" / "table.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def table(benchmark_module):
+    return benchmark_module("peers/table")
 
 
 def a_run(known, outside, errors=(0.1, 0.3)):
@@ -44,6 +40,8 @@ def test_a_run_that_fails_is_counted_and_a_tool_without_intervals_has_none(table
     entry = {"truth": TRUTH, "tools": {"x": {"runs": [silent, {"failed": "no"}], "lines": 3}}}
     assert table.figures(entry["tools"]["x"]["runs"], TRUTH)["failed"] == 1
     assert table.rows("springs", entry)[0][3:5] == ["no intervals"] * 2
+    left_out = {"versions": {}, "cases": {}, "left_out": {"servo": "whose recordings are not there"}}
+    assert table.markdown(left_out).endswith("**Left out:** servo, whose recordings are not there")
     assert table.rows("springs", {"truth": TRUTH, "tools": {"x": {"runs": [{"failed": "no"}]}}})[0][1] == "failed"
 
 

@@ -9,7 +9,7 @@ it to begin anew. The second writes table and chart of the documentation from it
 this package in FILE is worse than in STORED, beyond a tolerance (`TOLERANCES` in `table.py`).
 
 `pip install -e '.[peers]'` has what is needed but for opty, which needs an installed IPOPT (`pip install opty`). What
-is not installed is left out and named.
+is not installed is left out and named, and so is the servo pendulum where its recordings are not beside the clone.
 """
 
 from __future__ import annotations
@@ -99,8 +99,11 @@ def main() -> int:
     if chosen.against:
         from table import worse_figures
 
-        worse = worse_figures(known, json.loads(chosen.against.read_text(encoding="utf-8")))
+        stored = json.loads(chosen.against.read_text(encoding="utf-8"))
+        worse = worse_figures(known, stored)
         print("\n".join(worse) or "no figure is worse than the stored one")
+        for name in (each for each in stored["cases"] if each not in known["cases"]):
+            print(f"not compared: {name}, {known.get('left_out', {}).get(name, 'which was not asked for')}")
         return int(bool(worse))
     from cases import CASES, SERVO_FOLDER
 
@@ -114,9 +117,11 @@ def main() -> int:
         except (ImportError, PackageNotFoundError) as error:
             print(f"left out: {tool} is not installed ({error})", file=sys.stderr)
     known["versions"]["python"] = platform.python_version()
+    known["left_out"] = {}
     for name in chosen.cases or CASES:
         if CASES[name].needs_shared_recordings and not SERVO_FOLDER.is_dir():
-            print(f"left out: {name}, its recordings are not in {SERVO_FOLDER}", file=sys.stderr)
+            known["left_out"][name] = f"whose recordings are not in {SERVO_FOLDER}"
+            print(f"left out: {name}, {known['left_out'][name]}", file=sys.stderr)
             continue
         case = CASES[name]
         entry = known["cases"].setdefault(
@@ -125,6 +130,7 @@ def main() -> int:
         known["cases"] = {key: known["cases"][key] for key in CASES if key in known["cases"]}
         for _ in run_case(name, tools, chosen.seeds, entry):
             chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    chosen.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

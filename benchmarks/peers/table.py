@@ -113,6 +113,7 @@ def markdown(known: Mapping[str, Any]) -> str:
         if not entry["truth"]:
             table = [[row[0], *row[5:]] for row in table]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in table))
+    parts += [f"**Left out:** {name}, {why}" for name, why in known.get("left_out", {}).items()]
     return "\n\n".join(parts)
 
 
