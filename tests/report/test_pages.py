@@ -6,9 +6,11 @@ import base64
 import gzip
 import html
 import importlib
+import itertools
 import json
 import logging
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,6 +21,7 @@ import numpy as np
 import plotly.offline
 import pytest
 
+from yid_ocp.cli import main
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
@@ -34,14 +37,18 @@ from yid_ocp.workflow.solve import solution_to_result_dict
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COMMANDS = {
-    "solve": (),
-    "check": (),
-    "simulate": ("--noise",),
-    "identifiability": ("--what-if", "--intervals", "all"),
-    "inspect": ("--entry", "p1[elbow]"),
-    "diagnose": ("--set", "diagnosis.candidates=[joint_coulomb, effort_offset]", "--set", "diagnosis.max_effects=1"),
-    "compare": ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}"),
+    "solve": "",
+    "check": "",
+    "simulate": "--noise",
+    "identifiability": "--what-if --intervals all",
+    "inspect": "--entry p1[elbow]",
+    "diagnose": "--set diagnosis.candidates=[joint_coulomb,effort_offset] --set diagnosis.max_effects=1",
+    "compare": "--set 'compare.methods={gauss_newton: {}, single_shooting: {}}'",
+    "friction": "",
+    "plan": "--set model.measured_points=[tip] --set 'plan={point: tip, point_target_offset_from_start: [0, 0.1, 0]}'",
+    "report": "",
 }
+LOOKS = list(itertools.product((1400, 400), ("light", "dark")))
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open pages with")
 PROBE = """
 <script>
@@ -64,17 +71,18 @@ addEventListener("load", async () => {
   viewers.forEach((viewer) => { viewer.at(viewer.from); viewer.play(); });
   const played = () => viewers.map((viewer) => viewer.time > viewer.from);
   for (let i = 0; i < 200 && played().includes(false); i++) await new Promise((go) => setTimeout(go, 20));
+  const told = [...document.querySelectorAll(".said")].at(-1) ?? viewers[0].canvas;
+  const below = told.getBoundingClientRect().bottom - innerHeight;
   const { style } = document.body;
   const fit = () => boxes.every((box) => box.querySelector(".main-svg").clientWidth <= box.clientWidth);
   style.width = "320px";
-  for (let i = 0; i < 200 && !fit(); i++) await new Promise((go) => setTimeout(go, 20));
+  for (let i = 0; i < 5000 && !fit(); i++) await new Promise((go) => setTimeout(go, 20));
   const narrowed = fit();
   style.width = "";
   parent.postMessage(JSON.stringify({
     width: innerWidth, wide, scroll: document.documentElement.scrollWidth,
     cut: cut.map((e) => e.outerHTML.slice(0, 80)), narrowed,
-    boxes: boxes.length, drawn: document.querySelectorAll(".plot .main-svg").length, moments,
-    played: played(),
+    boxes: boxes.length, drawn: document.querySelectorAll(".plot .main-svg").length, moments, played: played(), below,
     dark: matchMedia("(prefers-color-scheme: dark)").matches, ground: getComputedStyle(document.body).backgroundColor,
   }), "*");
 });
@@ -286,7 +294,7 @@ def check_in_browser(page: Path, width: int, scheme: str, folder: Path) -> None:
     )
     command = [
         CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
-        "--window-size=1500,1000", "--virtual-time-budget=60000", f"--user-data-dir={folder / 'profile'}",
+        "--window-size=1500,1000", "--virtual-time-budget=240000", f"--user-data-dir={folder / 'profile'}",
         f"--blink-settings=preferredColorScheme={int(scheme == 'light')}", outer.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
@@ -300,6 +308,7 @@ def check_in_browser(page: Path, width: int, scheme: str, folder: Path) -> None:
     assert seen["scroll"] <= seen["wide"]
     assert seen["drawn"] >= seen["boxes"]
     assert seen["narrowed"]
+    assert seen["below"] <= 0, "the verdict is not on the first screen"
     assert seen["ground"] == ("rgb(21, 27, 32)" if scheme == "dark" else "rgb(255, 255, 255)")
     for i in range(0, len(seen["moments"]), 3):
         assert len(set(seen["moments"][i : i + 3])) == 3, "the picture does not move"
@@ -308,8 +317,6 @@ def check_in_browser(page: Path, width: int, scheme: str, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def solved_page(tmp_path_factory, pendulum_data) -> Path:
-    from yid_ocp.cli import main
-
     out = tmp_path_factory.mktemp("page") / "run"
     (pendulum_data.folder / "page.yaml").write_text(pendulum_data.text)
     assert main(["solve", str(pendulum_data.folder / "page.yaml"), "--out", str(out)]) == 0
@@ -349,17 +356,29 @@ def test_a_page_takes_no_script_of_somebody_else(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_writes_a_page_that_says_what_the_terminal_says(command, printed, pendulum, tmp_path):
-    out = printed(command, pendulum, "--out", "run", *COMMANDS[command])
+def test_the_page_of_a_command_says_what_the_terminal_says(command, printed, pendulum, solved_page, tmp_path):
+    given = [pendulum]
+    if command == "report":
+        given = [solved_page.parent, "other"]
+        printed("solve", pendulum, "--out", "other", "--set", "parameters.elbow.damping.free=false")
+    out = printed(command, *given, "--out", "run", *shlex.split(COMMANDS[command]))
     page = tmp_path / "run" / "report.html"
     told = text_of(page.read_text(encoding="utf-8"))
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    result = json.loads((tmp_path / "run" / ("overlay.json" if command == "report" else "result.json")).read_text())
     assert result["command"] in told
     assert result["date"] in told
     assert_same_words(out, told)
-    if CHROMIUM is not None:
-        for width, scheme in ((1400, "dark"), (400, "light")):
-            check_in_browser(page, width, scheme, tmp_path)
+    for look in LOOKS if CHROMIUM else ():
+        check_in_browser(page, *look, tmp_path)
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_browser_draws_the_picture_of_a_guess(printed, pendulum_data, urdf_folder, tmp_path):
+    recording = pendulum_data.folder / "estimate.h5"
+    printed("init", urdf_folder / "double_pendulum.urdf", recording, "--out", tmp_path / "run.yaml")
+    for look in LOOKS:
+        check_in_browser(tmp_path / "run.html", *look, tmp_path)
 
 
 def assert_same_words(out: str, page: str) -> None:

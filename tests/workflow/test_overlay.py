@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
+from yid_ocp.cli import main
 from yid_ocp.report import diagnosis_summaries  # noqa: F401, it registers
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.run_history import _overlaid_parameters
@@ -15,8 +16,6 @@ from yid_ocp.workflow.run_history import _overlaid_parameters
 @pytest.fixture(scope="module")
 def two_runs(pendulum_data, tmp_path_factory):
     """Run folders of two models of the same recordings: the second one keeps one parameter at its initial value."""
-    from yid_ocp.cli import main
-
     folder = tmp_path_factory.mktemp("overlay")
     (folder / "pendulum.yaml").write_text(pendulum_data.text + "output: {write_report: false}\n")
     [fixed, *_] = pendulum_data.truth

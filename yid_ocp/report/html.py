@@ -112,7 +112,7 @@ def _column_classes(table: SummaryTable) -> list[str]:
     kinds: list[str] = []
     for _, *cells in zip(*table.rows, strict=True):
         wide = max(map(len, cells), default=0) > _WRAP_LENGTH
-        numbers = [bool(_NUMBER.match(cell)) for cell in cells if cell and cell not in _STATE_WORDS]
-        kind = "number" if numbers and all(numbers) else "long" if wide else "text"
+        shown = [cell.removesuffix(" (fixed)") for cell in cells if cell and cell not in _STATE_WORDS]
+        kind = "number" if shown and all(map(_NUMBER.match, shown)) else "long" if wide else "text"
         kinds.append(kind if any(cells) else "")
     return kinds
