@@ -23,7 +23,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def message_parts(self) -> dict[str, str]:
-        """Return the parts of the message: what, where, allowed, hint. A general text replaces a missing where or allowed."""
+        """Return what, where, allowed and hint as shown; a general text replaces a missing where or allowed."""
         said = {
             "what": self.what,
             "where": self.where or "the arguments of this command or function",
