@@ -88,7 +88,7 @@ def tasks_of(count: int, **arguments: Any) -> list[Task]:
 
 @pytest.fixture
 def threads(monkeypatch):
-    monkeypatch.setattr(parallel_tasks, "_give_back", lambda: None)  # of the many objects of a test run
+    monkeypatch.setattr(parallel_tasks.gc, "collect", lambda: 0)  # of the many objects of a test run
     with ThreadPoolExecutor(max_workers=2) as pool:
         yield pool
 

@@ -5,6 +5,7 @@ from yid_ocp.parallel.resumable_tasks import Task as Task
 from yid_ocp.parallel.resumable_tasks import TaskResult as TaskResult
 from yid_ocp.parallel.resumable_tasks import WorkerConfig as WorkerConfig
 from yid_ocp.parallel.resumable_tasks import require_task_values as require_task_values
+from yid_ocp.parallel.resumable_tasks import return_freed_memory as return_freed_memory
 from yid_ocp.parallel.resumable_tasks import run_tasks as run_tasks
 from yid_ocp.parallel.threads_and_processes import CASADI_LOCK as CASADI_LOCK
 from yid_ocp.parallel.threads_and_processes import CasadiLockedCache as CasadiLockedCache

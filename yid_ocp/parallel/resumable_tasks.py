@@ -233,18 +233,17 @@ def _perform(job: _Job) -> str:
             write_strict_json(failed, {**entry, "error": text})
         return text
     finally:
-        _give_back()
+        gc.collect()
+        return_freed_memory()
     with contextlib.suppress(OSError):
         failed.unlink(missing_ok=True)
     return ""
 
 
-def _give_back() -> None:
+def return_freed_memory() -> None:
     """Return freed memory to the system, because Linux's C library keeps half a gigabyte after a solve."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
-        trim(0)
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _drain(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
 import json
 import math
 import os
@@ -180,8 +179,6 @@ class StderrLogLinesProgress(Progress):
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Print a line with the name of the stage and the remaining time."""
         interruption.raise_if_interrupted()
-        with contextlib.suppress(OSError, AttributeError, TypeError):
-            ctypes.CDLL(None).malloc_trim(0)  # give back what the last stage freed (glibc)
         self._tenths, self._last = 0, time.monotonic()
         self._left.begin_stage(work, ahead)
         print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)

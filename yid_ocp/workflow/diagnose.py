@@ -36,6 +36,7 @@ from yid_ocp.inference.uncertainty import (
     verdict_by_relative_std,
 )
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
+from yid_ocp.parallel import return_freed_memory
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
@@ -179,6 +180,7 @@ class _LoggedProgress(Progress):
     folder: RunFolder
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
+        return_freed_memory()
         self.folder.log_event("stage", text=text)
         self.shown.begin_stage(text, work, ahead)
 
