@@ -49,7 +49,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
-SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "its orientation to gravity"
+SPEED, ACCELERATION, GRAVITY = "the speed", "the acceleration", "the orientation to gravity"
 REASONS = ("little", "stand_in")
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 

@@ -77,8 +77,8 @@ def plan_blind_cases(
     needs an experiment in `chains`. `seed` and `purpose` determine the order. Raises `ConfigError` if `count` < 1.
     """
     if count < 1:
-        what, hint = f"the number of cases is {count}, but must be at least 1", "set --cases 1 or more"
-        raise ConfigError(what, where="--cases", allowed="a whole number from 1", hint=hint)
+        what, hint = f"the number of cases is {count}, but must be at least 1", "leave --cases out, or give more"
+        raise ConfigError(what, where="count (--cases)", allowed="a whole number from 1", hint=hint)
     total = sum(weights.values())
     kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
     kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}

@@ -41,7 +41,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         advice = (
             (aspects, f"Record one motion{at} in which these vary independently and widely: {', '.join(aspects)}."),
             (places, f"Move {' and '.join(places)} one after the other, or measure a point between them."),
-            (rivals, f"Record a motion{at} in which this varies over a wider range: {aspects[0]}."),
+            (rivals, f"Record a motion in which {aspects[0]}{at} varies over a wider range."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
             return told[0]

@@ -86,7 +86,7 @@ class _EncoderOffset(_DistortedReading):
     """Constant offset of a joint's measured angle. Prescribed, initial and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     possible_locations = _recorded_joints
     declared_parameters = (ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true"),)
 
@@ -99,7 +99,7 @@ class _SeriesElasticity(_DistortedReading):
     """Elastic gear with the encoder on the motor side. At joint angle q, the measured angle is q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
-    required_excitation = "how hard it pulls at its ends"
+    required_excitation = "the force at its ends"
     required_sensors = frozenset({"joints.position", "joints.effort"})
     declared_parameters = (base.compliance_parameter_definition("rad/(N m)", 0.02, (5e-4, 0.01), "gear", "N m/rad"),)
 
@@ -116,7 +116,7 @@ class _Backlash(_DistortedReading):
     """
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
-    required_excitation = "how hard it pulls at its ends"
+    required_excitation = "the force at its ends"
     possible_locations = _geared_joints
     declared_parameters = (ParameterDefinition("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
 
@@ -159,7 +159,7 @@ class _DistortedEffort(_DistortedReading):
     """The base class of errors of one joint's recorded effort."""
 
     quantity = "joints.effort"
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     required_sensors = frozenset({"joints.effort"})
 
 
@@ -212,7 +212,7 @@ class _EffortOffset(_DistortedEffort):
 class _LateTorque(EffectBase):
     """The base class of torques that act later than recorded. At a prescribed joint, the recorded effort is early."""
 
-    required_excitation = "when it is read"
+    required_excitation = "the rate of its readings"
     required_sensors = frozenset({"joints.effort"})
 
     def _lateness(self, channel: str, joints: tuple[str, ...], size: ca.SX) -> ca.SX:
@@ -261,7 +261,7 @@ class _EffortLag(_LateTorque):
 class _ServoChange(EffectBase):
     """The base class of differences between a position servo and its nominal model."""
 
-    required_excitation = "how hard it accelerates"
+    required_excitation = "the acceleration"
     required_sensors = frozenset({"joints.position"})
     possible_locations = base.servo_joint_names
 
@@ -307,7 +307,7 @@ class _BackEmf(_ServoChange):
     """Scale factor on a DC motor's back-EMF damping kt^2/R, its braking torque per speed."""
 
     equation = "torque = clip(gain (u - q)) - scale damping v"
-    required_excitation = "how fast it moves"
+    required_excitation = "the speed"
     possible_locations = _dc_motor_joints
     declared_parameters = (
         ParameterDefinition("scale", "1", 1.0, 0.0, 20.0, (0.0, 3.0), "true over nominal torque per speed"),
@@ -337,7 +337,7 @@ class _ServoDelay(_ServoChange):
     """Delay of a servo's commands, added to its nominal delay."""
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
-    required_excitation = "when it is read"
+    required_excitation = "the rate of its readings"
     declared_parameters = (
         ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),
     )

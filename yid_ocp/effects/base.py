@@ -79,7 +79,7 @@ class EffectBase(Effect):
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
     # what a motion must vary to distinguish the kind from others; the text continues "vary ..."
-    required_excitation: ClassVar[str] = "how it moves"
+    required_excitation: ClassVar[str] = "the motion"
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)
     is_local: ClassVar[bool] = False

@@ -48,7 +48,7 @@ def _carried_body(system: System, joint: int) -> _CarriedBody:
 class _ScaledBodies(EffectBase):
     """Masses and inertias of some bodies multiplied by a factor."""
 
-    required_excitation = "how hard it accelerates"
+    required_excitation = "the acceleration"
 
     def _joints(self, system: System) -> tuple[str, ...]:
         raise NotImplementedError
@@ -115,7 +115,7 @@ class _PointMass(EffectBase):
     """Point mass fixed to a frame. It adds the energies T += 1/2 mass |v|^2 and V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
-    required_excitation = "how hard it accelerates"
+    required_excitation = "the acceleration"
     is_local = is_load = True
     possible_locations = _moving_frames
     candidate_locations = _tips_and_link_ends
@@ -154,7 +154,7 @@ class _Payload(EffectBase):
     """
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     is_local = is_load = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
@@ -254,7 +254,7 @@ class _LengthScale(EffectBase):
     """Scale factor on the link lengths of a segment. Its mass is unchanged."""
 
     equation = "link lengths times scale"
-    required_excitation = "how long it is"
+    required_excitation = "the posture"
     possible_locations = _segments_with_length
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
@@ -268,7 +268,7 @@ class _RotorInertia(EffectBase):
     """Rotor inertia of a motor, reflected to its joint. It adds the kinetic energy 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
-    required_excitation = "how hard it accelerates"
+    required_excitation = "the acceleration"
     possible_locations = base.arm_joint_names
     declared_parameters = (
         base.effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "rotor inertia at the joint"),
@@ -288,7 +288,7 @@ class _AerodynamicDrag(EffectBase):
     """
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
-    required_excitation = "how fast it moves"
+    required_excitation = "the speed"
     possible_locations = base.flexible_segment_names
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
@@ -318,7 +318,7 @@ class _GravityScale(EffectBase):
     """Additional weight of the object as a fraction of its full weight. Its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     possible_locations = lambda system: ("object",) if system.segment_layouts else ()
     declared_parameters = (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "added over full weight"),)
 
@@ -337,7 +337,7 @@ class _GravityTilt(EffectBase):
     """Rotation of gravity by rx about the world's x axis, then by ry about its y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     possible_locations = lambda system: ("world",)
     declared_parameters = tuple(
         ParameterDefinition(f"r{axis}", "rad", 0.0, -0.5, 0.5, (-0.05, 0.05), f"turn about {axis}") for axis in "xy"

@@ -40,7 +40,7 @@ class _JointFriction(EffectBase):
 
     sign_smoothing_speed: float = SIGN_SMOOTHING_SPEED  # v_s [rad/s]
 
-    required_excitation = "how fast it moves"
+    required_excitation = "the speed"
     possible_locations = base.arm_joint_names
 
     @property
@@ -160,7 +160,7 @@ class _JointPresliding(EffectBase):
     """
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
-    required_excitation = "how fast it moves"
+    required_excitation = "the speed"
     possible_locations = base.arm_joint_names
     declared_parameters = (
         effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
@@ -201,7 +201,7 @@ class _JointSpring(EffectBase):
     """Spring on an arm joint. It adds the elastic energy V += 1/2 stiffness (q - rest_angle)^2."""
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
-    required_excitation = "how far it bends"
+    required_excitation = "the angle"
     possible_locations = base.arm_joint_names
     declared_parameters = (
         effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),

@@ -68,7 +68,7 @@ class TorqueLaw(base.EffectBase):
     knots: Mapping[str, Array] | None = None  # knots of every quantity
 
     equation = "F = f(x)"
-    required_excitation = "how far it bends"
+    required_excitation = "the angle"
 
     @property
     def quantities(self) -> tuple[str, ...]:

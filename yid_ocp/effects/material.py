@@ -37,7 +37,7 @@ class _SegmentEffect(EffectBase):
 class _SegmentMemory(_SegmentEffect):
     """The base class of effects with one internal coordinate for every elastic joint of a segment."""
 
-    required_excitation = "how long it is held"
+    required_excitation = "the holding time"
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ class _SegmentMemory(_SegmentEffect):
 class _SpringChange(_SegmentEffect):
     """The base class of effects that change the springs of a segment."""
 
-    required_excitation = "how far it bends"
+    required_excitation = "the angle"
 
     def _changed(self, spring: ElasticJoint) -> ElasticJoint:
         raise NotImplementedError
@@ -62,7 +62,7 @@ class _KelvinVoigt(_SegmentEffect):
     """Kelvin-Voigt damping on all joints of a segment, F = -tau kappa v with the joint stiffness kappa."""
 
     equation = "F = -tau kappa v"
-    required_excitation = "how fast it moves"
+    required_excitation = "the speed"
     declared_parameters = (ParameterDefinition("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
@@ -137,7 +137,7 @@ class _CubicStiffness(_SegmentEffect):
     """
 
     equation = "V += 1/4 k3 q^4"
-    required_excitation = "how far it bends"
+    required_excitation = "the angle"
     declared_parameters = (
         replace(
             ParameterDefinition("k3", "N m/rad^3", 0.0, -10.0, 50.0, (-0.5, 1.0), "cubic stiffness of every joint"),

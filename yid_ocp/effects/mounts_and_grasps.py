@@ -42,7 +42,7 @@ def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
 class _JointInsertion(EffectBase):
     """The base class of massless two-axis springs at rigid connections. They relax in `_SPRING_RELAXATION_TIME`."""
 
-    required_excitation = "how hard it pulls at its ends"
+    required_excitation = "the force at its ends"
     declared_parameters = (
         base.compliance_parameter_definition("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),
     )
@@ -104,7 +104,7 @@ class _JunctionCompliance(_JointInsertion):
 class _GraspChange(EffectBase):
     """The base class of effects that change one grasp."""
 
-    required_excitation = "how hard it pulls at its ends"
+    required_excitation = "the force at its ends"
     possible_locations = base.grasp_names
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class _GraspSlip(_GraspChange):
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"
-    required_excitation = "how long it is held"
+    required_excitation = "the holding time"
     declared_parameters = (
         ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), "creep rate per axial load"),
     )

@@ -97,7 +97,7 @@ class _CameraLatency(_CameraEffect):
     """
 
     equation = "seen point(t) = true point(t - delay)"
-    required_excitation = "when it is read"
+    required_excitation = "the rate of its readings"
     required_sensors = frozenset()
     is_at_point_groups = True
     declared_parameters = (ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago it was there"),)
@@ -117,7 +117,7 @@ class _ClockScale(EffectBase):
     """Scale error of a nominal clock: recorded time = true time x scale."""
 
     equation = "recorded time = true x scale"
-    required_excitation = "when it is read"
+    required_excitation = "the rate of its readings"
     required_sensors = frozenset({"nominal_clock"})
     possible_locations = lambda system: ("clock",)
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.7, 1.4, (0.9, 1.1), "recorded over true time"),)
@@ -141,7 +141,7 @@ def _mounted(system: System) -> tuple[str, ...]:
 class _MountedSensorEffect(EffectBase):
     """The base class of errors of a wrist sensor or an inertial unit, at the location `wrist:FRAME` or `imu:FRAME`."""
 
-    required_excitation = "its orientation to gravity"
+    required_excitation = "the orientation to gravity"
     is_at_recorded_sensor = True
     is_local = True
     possible_locations = _mounted
@@ -181,7 +181,7 @@ class _SensorScale(_MountedSensorEffect):
     """Scale factor on all readings of a wrist sensor or an inertial unit."""
 
     equation = "measured = scale x true"
-    required_excitation = "how hard it pulls at its ends"
+    required_excitation = "the force at its ends"
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.5, 2.0, (0.9, 1.1), "measured over true"),)
 
     def _read(self, quantity: str, output: ca.SX) -> ca.SX:

@@ -38,7 +38,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     if values.size not in (1, nu) and nu % max(values.size, 1):
         what = f"the settings have {values.size} gains for {nu} driven joints"
         allowed = f"1 gain, {nu} gains or, of several equal arms, one gain for each joint of an arm"
-        hint = f"set one gain for all joints, such as [{values[0]:g}], or {nu} gains"
+        hint = f"give one gain for all joints, or {nu} gains, one for each joint in the order of the model"
         raise ModelError(what, where="problem.arm_proportional_gains", allowed=allowed, hint=hint)
     values = np.resize(values, nu)
     if np.any(values < 0):

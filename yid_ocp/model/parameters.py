@@ -32,7 +32,7 @@ class Parameter:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
             what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
-            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint="pass value=1.0, for example")
+            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint="pass a finite `value`")
         if not self.lower <= self.value <= self.upper:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)

@@ -348,7 +348,11 @@ def _dask_executor(
 
     def look() -> None:
         if not client.nthreads():
-            log.warning("the scheduler at %s has no workers, so the tasks wait: start `dask worker`", scheduler)
+            log.warning(
+                "the scheduler at %s has no workers, so the tasks wait: start `dask worker %s --nthreads 1`",
+                scheduler,
+                scheduler,
+            )
 
     with client:
         look()
@@ -377,8 +381,8 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
             raise ParallelWorkError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()
     for address, entry in client.get_versions()["workers"].items():
-        said = str(entry["host"]["python"])
-        if said.split(".")[:2] != here["python"].split("."):  # functions do not travel between these
+        said = ".".join(str(entry["host"]["python"]).split(".")[:2])
+        if said != here["python"]:  # functions do not travel between these
             raise _unfit(address, [f"python {said} instead of {here['python']}"])
     module = "" if function is None or function.__module__ == "__main__" else function.__module__
     with contextlib.ExitStack() as held:

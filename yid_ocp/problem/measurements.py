@@ -53,9 +53,9 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
-        what = f"{span:.3g} s of data with {len(t)} samples are {steps:.3g} time steps of {time_step:g} s, too many"
+        what = f"{span:.3g} s of data with {len(t)} samples need {steps:.3g} time steps of {time_step:g} s, too many"
         allowed = f"at most {_MAX_STEPS} time steps, and {_MAX_STEPS_PER_SAMPLE} per sample"
-        hint = "check that times are in seconds and the clock does not jump, or set problem.duration to use less"
+        hint = "set a larger problem.time_step or a smaller problem.duration; if times are not in seconds, correct them"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"

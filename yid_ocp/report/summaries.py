@@ -326,9 +326,9 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f" ({len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat)" if len(gains) > 1 else ""
-    more = f"The search raised its information by {best['value'] - best['first']:.3g} nat{others}."
-    yield f"Random start {result['best'] + 1} of {len(starts)} led to the most informative motion. {more}"
+    others = f", which ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
+    more = f"It is the best of {len(starts)} searches from random motions{others}."
+    yield f"The search raised the information of the motion by {best['value'] - best['first']:.3g} nat. {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"The motion reaches these limits: {'; '.join(reached)}." if reached else "The motion reaches no limit."
     yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())

@@ -140,11 +140,12 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport]) -> list[Frame
         reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
         if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
-            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, the median is {1e3 * usual:.1f} mm"
-            reason = f"the shape fits worse than in other frames: {off} ({_MAX_DISTANCE_OVER_MEDIAN} times are allowed)"
+            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average. In a usual frame they are"
+            most = f"{1e3 * usual:.1f} mm from it (median), and {_MAX_DISTANCE_OVER_MEDIAN} times as much is allowed"
+            reason = f"the shape fits worse than in other frames: {off} {most}"
         elif apart > _MAX_GRASP_GAP_CHANGE:
-            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed (its time stamp may be late)"
-            reason = f"{_END_ELSEWHERE}: the gap is {1e3 * apart:.0f} mm larger than usual, {most}"
+            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed. The time stamp may be late"
+            reason = f"{_END_ELSEWHERE}: the gap differs by {1e3 * apart:.0f} mm from the usual one; {most}"
         made[k] = replace(frames[k], drop_reason=reason)
     return made
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.arrays import Vector3
-from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.errors import ConfigError, ModelError, nearest_name_question
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.model.flexible import FlexibleSegment
 from yid_ocp.model.mechanism import rotation_from_rpy
@@ -143,7 +143,10 @@ def _grown(branches: Sequence[tuple[str, _SegmentGeometry]]) -> dict[str, _Segme
             raise ConfigError(what, where="--branch", allowed=allowed, hint=f"rename one of them to '{name}_2'")
         if branch.parent is not None and branch.parent not in made:
             what = f"branch '{name}' grows on '{branch.parent}', which is not an earlier branch"
-            allowed, hint = ", ".join(made) or "a branch without @PARENT", "put the --branch of the parent before it"
+            others = [other for other, _ in branches if other != name]
+            is_later, question = branch.parent in others, nearest_name_question(branch.parent, others)
+            hint = f"put the --branch of '{branch.parent}' before it" if is_later else question or "correct the parent"
+            allowed = f"@ and a branch before it ({', '.join(made) or 'none'}), or no @: then it begins at the root"
             raise ConfigError(what, where="--branch", allowed=allowed, hint=hint)
         made[name] = branch
     return made
