@@ -368,8 +368,8 @@ class ExperimentVariantSensitivityBuilder:
     def _welded(self, system: System, others: frozenset[str]) -> System:
         layout = self.position_sensitivities_of_variant(others)
         if isinstance(layout, str):
-            allowed, hint = "changes that work without welded grasps", "leave `weld` out of considered_changes"
-            raise SolverError(layout, where=f"changes {', '.join(sorted(others))}", allowed=allowed, hint=hint)
+            where, hint = " and ".join(sorted(others)) or "the recorded experiment", "leave the change `weld` out"
+            raise SolverError(layout, where=where, allowed="experiments that can be simulated", hint=hint)
         problem, n = layout.problem, system.n_coordinates
         theta, offset = problem.unpack_episode_unknowns(layout.x, 0)
         theta = problem.predictor.theta_with_episode_values(problem.episodes[0], theta)

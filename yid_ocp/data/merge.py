@@ -91,9 +91,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
     for recording in (first, other):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
-    said = (
-        f"{first.name} and {other.name} are assumed to have one clock, because their times overlap by {overlap:.4g} s"
-    )
+    said = f"{first.name} and {other.name} are assumed to have one clock, as their times overlap by {overlap:.4g} s"
     seen, joints = _seen_path(other), first.joints
     best = at_zero = None
     if seen is not None and joints is not None and len(joints.t) >= _MIN_SAMPLES:
@@ -108,10 +106,8 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
             return 0.0, said
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
             share = f"which explains {best.explained:.0%} of their motion"
-            said += f"; but {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): either the sensor or its clock is not in "
-            said += (
-                "step, or the object swings behind the arm. `yid-ocp check` says how to decide; for a clock, import "
-            )
+            said += f"; but {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): either its clock is wrong, or the "
+            said += "object swings behind the arm. `yid-ocp check` says how to decide; for a clock, import "
             said += f"again with this option (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:

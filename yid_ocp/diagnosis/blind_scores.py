@@ -551,8 +551,8 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     repeated. Raises `DataError` if the case was recorded in another format.
     """
     if data.get("format") != _EVIDENCE_FORMAT:
-        hint = "repeat `yid-ocp blind`, or rescore with the version of yid_ocp that made the cases"
-        what = f"the answer has the evidence format '{data.get('format')}' of another version of yid_ocp"
+        hint = "run `yid-ocp blind` again, or rescore with the version of yid_ocp that made the answers"
+        what = f"the answers of the cases have the format '{data.get('format')}' of another version of yid_ocp"
         raise DataError(what, where="key `evidence` of a file in answers/", allowed=_EVIDENCE_FORMAT, hint=hint)
     known = {entry.name for entry in fields(Thresholds)}
     kept = {name: value for name, value in data["thresholds"].items() if name in known}

@@ -132,7 +132,7 @@ class ServoModelOptions:
 
     def __post_init__(self) -> None:
         if "derivative" in self.extra_controller_terms and self.motor.kind == "ideal":
-            what = "derivative is not possible with an ideal motor, whose derivative gain is JOINT.servo_damping"
+            what = "an ideal motor has a derivative term (JOINT.servo_damping), so `derivative` cannot be added"
             hint = "leave derivative out, or set model.arms.servo.motor.kind: dc"
             where = "model.arms.servo.extra_controller_terms"
             raise ConfigError(what, where=where, allowed="derivative only with kind: dc", hint=hint)

@@ -348,11 +348,7 @@ def _dask_executor(
 
     def look() -> None:
         if not client.nthreads():
-            log.warning(
-                "the scheduler at %s has no workers, so the tasks wait: start `dask worker %s --nthreads 1`",
-                scheduler,
-                scheduler,
-            )
+            log.warning("no worker is ready, so the tasks wait: start `dask worker %s --nthreads 1`", scheduler)
 
     with client:
         look()

@@ -56,7 +56,7 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
         what = f"{span:.3g} s of data with {len(t)} samples need {steps:.3g} time steps of {time_step:g} s, too many"
         allowed = f"at most {_MAX_STEPS} time steps, and {_MAX_STEPS_PER_SAMPLE} per sample"
         hint = "set a larger problem.time_step or a smaller problem.duration; if times are not in seconds, correct them"
-        raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
+        raise DataError(what, where=f"problem.time_step, recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
         hint, allowed = "set a smaller problem.time_step, or record longer", f"at least {2 * time_step:g} s of data"

@@ -330,12 +330,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     more = f"It is the best of {len(starts)} searches from random motions{others}."
     yield f"The search raised the information of the motion by {best['value'] - best['first']:.3g} nat. {more}"
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"The motion reaches these limits: {'; '.join(reached)}." if reached else "The motion reaches no limit."
+    yield f"The motion reaches the limits: {'; '.join(reached)}." if reached else "The motion stays within all limits."
     yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
-        yield "The information was computed with the parameters of the configuration. Other true values change it."
+        yield "The information holds for the parameters of the configuration. With other true values it changes."
 
 
 @register_summary("yid-check/1")

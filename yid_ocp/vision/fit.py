@@ -102,7 +102,7 @@ class ShapeFitter:
         self.options = options or ShapeFitOptions()
         if not system.segment_layouts:
             what, hint = "the model has no object whose shape could be fitted", "set model.object, such as kind: foam_y"
-            raise DataError(what, where="model.object", allowed="an object of segments", hint=hint)
+            raise DataError(what, where="model.object", allowed="an object made of segments", hint=hint)
         bends = [entry for entry in system.elastic_joints if entry.deformation == "bend" and entry.axis]
         self.bend_joints = tuple(system.mechanism.joint_index(entry.joint_name) for entry in bends)
         self.free_joints = (*self.bend_joints, *(system.mechanism.joint_index(name) for name in loose))

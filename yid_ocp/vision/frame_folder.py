@@ -132,7 +132,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
         if name == "vertex":
             return _vertices(path, count, columns, order, body, coloured)
         if any(not kind for _, kind in columns):  # their length is unknown
-            raise _damaged(path, f"lists ('{name}') before the vertices are not supported")
+            raise _damaged(path, f"it has lists ('{name}') before the vertices, so write the vertices first")
         if order:
             body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]
         else:

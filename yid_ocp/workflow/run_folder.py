@@ -198,13 +198,8 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed = "no folder of this name, or the folder of an interrupted run"
-            what = "the run needs this hidden folder while it works, but the folder has files that are not from a run"
-            raise OutputError(
-                what,
-                where=str(temporary),
-                allowed=allowed,
-                hint="rename or remove this folder, or choose another --out",
-            )
+            what = "a run works in this hidden folder, but the folder has files that are not from a run"
+            raise OutputError(what, where=str(temporary), allowed=allowed, hint="rename it, or choose another --out")
         lock = _locked(temporary)
         if lock is None:
             continue

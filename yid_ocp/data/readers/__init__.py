@@ -76,9 +76,8 @@ def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
         near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
         hint = nearest_name_question(path.name, near) or "correct the path: its folder has no file of a similar name"
-        raise DataError(
-            "there is no such file", where=str(path), allowed="the path of a readable file or folder", hint=hint
-        )
+        allowed = "the path of a file or folder that you may read"
+        raise DataError("there is no such file", where=str(path), allowed=allowed, hint=hint)
     key = path.suffix.lower()
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
