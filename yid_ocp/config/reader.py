@@ -23,7 +23,7 @@ from ruamel.yaml.scanner import Scanner
 
 from yid_ocp import options
 from yid_ocp.config import schema
-from yid_ocp.config.settings import RunSettings
+from yid_ocp.config.settings import RunSettings, innermost_location
 from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.files import read_input_text
 
@@ -246,12 +246,8 @@ class _Reader:
     base: Path
 
     def where(self, path: _KeyPath) -> str:
-        key = ".".join(map(str, path))
-        for count in range(len(path), 0, -1):
-            if path[:count] in self.places:
-                place = self.places[path[:count]]
-                return place if place == f"--set {key}" else f"{place}: {key}"
-        return f"{self.origin}: {key}" if key else self.origin
+        key, place = ".".join(map(str, path)), innermost_location(self.places, path) or self.origin
+        return place if not key or place == f"--set {key}" else f"{place}: {key}"
 
     def build(self, hint: Any, raw: Any, path: _KeyPath, default: Any = MISSING) -> Any:
         sections, entries = schema.section_variants_from_annotation(hint), options.variadic_tuple_entry_type(hint)

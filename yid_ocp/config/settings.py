@@ -451,15 +451,17 @@ class RunSettings:
 
     def setting_location(self, *path: str | int) -> str:
         """Return the place of a setting (file, line and key) as text, for the `where` of an error message."""
-        key = ".".join(str(part) for part in path)
-        for count in range(len(path), 0, -1):
-            if path[:count] in self.key_locations:
-                return f"{self.key_locations[path[:count]]}: {key}"
-        return f"{self.config_file}: {key}" if self.config_file else key
+        key, place = ".".join(map(str, path)), innermost_location(self.key_locations, path) or self.config_file
+        return f"{place}: {key}" if place else key
 
     def config_error(self, what: str, *path: str | int, hint: str, allowed: str = "") -> ConfigError:
         """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""
         return ConfigError(what, where=self.setting_location(*path), allowed=allowed, hint=hint)
+
+
+def innermost_location(locations: Mapping[tuple[str | int, ...], str], path: tuple[str | int, ...]) -> str | None:
+    """Return the location of a key or, if it has none, of the innermost section around it that has one."""
+    return next((locations[path[:n]] for n in range(len(path), 0, -1) if path[:n] in locations), None)
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
