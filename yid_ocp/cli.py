@@ -32,7 +32,7 @@ _ERROR_FORMAT = "yid-error/1"
 
 
 @dataclass(frozen=True)
-class _CliCommand:
+class _Command:
     name: str
     help: str
     run: str | Callable[[argparse.Namespace], int]
@@ -297,27 +297,24 @@ _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and 
 _SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
 _SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
-COMMANDS = tuple(
-    _CliCommand(*row)
-    for row in (
-        ("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-        ("solve", "estimate the free parameters from recordings", "solve", _solve),
-        ("compare", "run several methods on one problem and compare their results", "compare", _doubting),
-        ("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
-        ("friction", "choose the friction law that the recordings justify", "friction", _doubting),
-        ("diagnose", "test for a gap between model and recordings, and name its cause", "diagnose", _diagnose),
-        ("blind", _SAID_BLIND, "blind", _blind),
-        ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-        ("report", _SAID_REPORT, "run_history", _report),
-        ("plan", "plan a motion of the arms with the identified model", "plan", _configured),
-        ("simulate", "simulate a recording with the model", "simulate", _simulate),
-        ("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
-        ("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-        ("track", "measure the object's points in the frames of a depth camera", "track", _track),
-        ("import", "turn a file of another tool into a recording", "import_recording", _import),
-        ("export", _SAID_EXPORT, "export", _export),
-        ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
-    )
+COMMANDS = (
+    _Command("init", "write a commented configuration from a robot and recordings of it", "init", _init),
+    _Command("solve", "estimate the free parameters from recordings", "solve", _solve),
+    _Command("compare", "run several methods on one problem and compare their results", "compare", _doubting),
+    _Command("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
+    _Command("friction", "choose the friction law that the recordings justify", "friction", _doubting),
+    _Command("diagnose", "test for a gap between model and recordings, and name its cause", "diagnose", _diagnose),
+    _Command("blind", _SAID_BLIND, "blind", _blind),
+    _Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
+    _Command("report", _SAID_REPORT, "run_history", _report),
+    _Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
+    _Command("simulate", "simulate a recording with the model", "simulate", _simulate),
+    _Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
+    _Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
+    _Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
+    _Command("import", "turn a file of another tool into a recording", "import_recording", _import),
+    _Command("export", _SAID_EXPORT, "export", _export),
+    _Command("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
 )
 
 
