@@ -38,8 +38,6 @@ _CONNECT_TIMEOUT = 15.0  # timeout for the connection to a scheduler [s]
 _MAX_CLIENT_STARTS = 3  # number of attempts to start a client's event loop
 log = logging.getLogger(__name__)
 _TaskFunction = Callable[..., Any]
-TaskProgressCallback = Callable[[int, int, str], None]
-"""Callback with the number of finished tasks, the number of all tasks, and the name of the last finished task."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ def run_tasks(
     tasks: Sequence[Task],
     folder: Path,
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
-    progress: TaskProgressCallback | None = None,
+    progress: Callable[[int, int, str], None] | None = None,  # finished tasks, all tasks, name of the last finished one
     code: str | None = None,
 ) -> list[TaskResult]:
     """Run a function for all tasks and return the results in the same order. Results stored in `folder` are reused.

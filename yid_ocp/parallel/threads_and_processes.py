@@ -24,8 +24,6 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _Key = TypeVar("_Key", bound=Hashable)
 _Value = TypeVar("_Value")
-_Query = TypeVar("_Query")
-_Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
@@ -153,13 +151,13 @@ def _answer(requests: Sequence[_Request]) -> None:
 
 
 def call_merged_with_other_threads(
-    function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]
-) -> list[_Answer]:
+    function: Callable[[list[_Item]], list[_Result]], questions: list[_Item]
+) -> list[_Result]:
     """Return `function(questions)`, computed in one call together with other items of `map_with_merged_calls`."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
-    found: list[_Answer] = march.ask(_Request(_THREAD_SHARE.rank, function, questions))
+    found: list[_Result] = march.ask(_Request(_THREAD_SHARE.rank, function, questions))
     return found
 
 
@@ -224,15 +222,14 @@ class InlineExecutor(Executor):
         return future
 
 
-def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Make a pool of `workers` processes (default: one per processor) that ignore interrupt signals.
+def process_pool(workers: int) -> ProcessPoolExecutor:
+    """Make a pool of `workers` processes that ignore interrupt signals.
 
     The limit on the threads of this process is divided among them, with at least one thread for each.
     """
-    count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
-    each = max(1, _max_threads() // count)
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(each,))
+    each = max(1, _max_threads() // workers)
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker, initargs=(each,))
 
 
 def _begin_worker(threads: int) -> None:
