@@ -23,7 +23,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError, unknown_name_error_arguments
 from yid_ocp.integrator.compiler import compile_casadi_function
-from yid_ocp.parallel import CASADI_LOCK
+from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 HessianKind = Literal["gauss_newton", "exact"]
 # Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
@@ -284,8 +284,6 @@ class ProgramVectorLayout:
 
 
 class _UserTerms(NamedTuple):
-    """User-defined objective term and constraint rows of a program."""
-
     objective: ca.MX
     constraints: ca.MX
     lower: Array
@@ -442,18 +440,15 @@ class NonlinearProgram(ReprMixin):
         return ca.MX.sym("lam_g", self.g.numel())
 
     @_ThreadSafeCachedProperty
-    def _hessians(self) -> dict[HessianKind, ca.MX]:
-        return {}
+    def _hessians(self) -> CasadiLockedCache[bool, ca.MX]:
+        return CasadiLockedCache(lambda exact: self._data_curvature(exact) + self._other_curvature(exact))
 
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
         """Return the sparse symmetric Hessian of the Lagrangian lam_f f + lam_g' g, exact or Gauss-Newton.
 
         Gauss-Newton neglects the curvature of residuals and of `constraint_terms`, but keeps that of user terms.
         """
-        with CASADI_LOCK:
-            if kind not in self._hessians:
-                self._hessians[kind] = self._data_curvature(kind == "exact") + self._other_curvature(kind == "exact")
-            return self._hessians[kind]
+        return self._hessians(kind == "exact")
 
     def _data_curvature(self, exact: bool) -> ca.MX:
         total = ca.MX(self.w.numel(), self.w.numel())
