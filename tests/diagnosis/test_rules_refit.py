@@ -40,7 +40,7 @@ class Problem:
     """A problem of one nominal parameter, an initial state and an effect, whose cost is a function of named values."""
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
-        self.cost, self.rows, self.unknown_names, self.nominal_free_parameter_names = cost, rows, names, ("k",)
+        self.cost, self.rows, self.unknown_names = cost, rows, names
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
         self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))

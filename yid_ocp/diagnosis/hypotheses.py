@@ -181,11 +181,6 @@ class AllCandidatesProblem:
 
         return self.problem.with_episodes(list(map(joined, self.problem.episodes, self.problem.held_out)), ())
 
-    @property
-    def nominal_free_parameter_names(self) -> tuple[str, ...]:
-        """The names of the free parameters of the nominal problem."""
-        return self.problem.free
-
     def candidates_with_prior_ranges_from_states(self, states: Sequence[Array]) -> tuple[EffectBase, ...]:
         """Return the candidates with prior ranges for the largest joint angles of each segment in `states` (N, nx)."""
         mechanism, largest = self.problem.system.mechanism, {}
@@ -281,7 +276,7 @@ class AllCandidatesProblem:
     def problem_with_nominal_and_effects_free(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem in which the nominal free parameters and all parameters of `effects` are free."""
         own = (name for effect in effects for name in effect.parameters.names)
-        return self.problem.with_free_parameters_without_recompiling((*self.nominal_free_parameter_names, *own))
+        return self.problem.with_free_parameters_without_recompiling((*self.problem.free, *own))
 
     def problem_with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
