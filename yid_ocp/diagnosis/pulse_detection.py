@@ -26,7 +26,7 @@ import scipy.linalg
 import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.integrator.step import Step, actuated_joint_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
@@ -306,9 +306,7 @@ class _Rest:
         return np.asarray(profiles.T @ self.scored), np.where(sure > 1e-6 * seen, sure, 0.0)
 
 
-def detect_force_pulses(
-    history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
-) -> tuple[list[DetectedForcePulse], float]:
+def detect_force_pulses(history: ForceEstimate, limits: Thresholds) -> tuple[list[DetectedForcePulse], float]:
     """Return the force pulses in a force estimate, largest evidence first, and the number of windows searched.
 
     The p-value of a pulse refers to a single window, so it must be corrected for the number of windows. Disjoint
