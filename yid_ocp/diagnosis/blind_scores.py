@@ -6,6 +6,7 @@ probability of at least k/(n + 1) (split conformal prediction: Vovk, Gammerman a
 
 from __future__ import annotations
 
+import decimal
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -380,7 +381,6 @@ def calibrate_thresholds(
     marks: Sequence[BlindCaseScore],
     answers: Sequence[Mapping[str, Any]],
     limits: Thresholds = DEFAULT_THRESHOLDS,
-    coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
     """Compute diagnosis thresholds as conformal quantiles of the statistics of a blind test (`yid-calibration/1`).
 
@@ -401,7 +401,7 @@ def calibrate_thresholds(
         sample = [value for _, value in scored if value > -math.inf]
         if rule.of == "clean":
             sample = [rule.statistic(said, limits, "") for said in clean]
-        value, attained = _conformal_quantile(sample, rule.side, coverage)
+        value, attained = _conformal_quantile(sample, rule.side)
         # for a lower bound from clean cases, small values indicate an effect
         sign = -1.0 if rule.of == "clean" and rule.side == "least" else 1.0
         sizes = sorted({m.multiple for m, _ in scored})
@@ -421,8 +421,8 @@ def calibrate_thresholds(
             "effects_beyond": {f"{size:.3g}": _binomial_proportion(hits) for size, hits in beyond.items()},
             "strange_beyond": _binomial_proportion(strange),
         }
-    odds, settings = _log_odds_regression(marks), _recommended_settings(found)
-    return {"format": _CALIBRATION_FORMAT, "asked": coverage, "rules": found, "log_odds": odds, "settings": settings}
+    head = {"format": _CALIBRATION_FORMAT, "asked": _TARGET_COVERAGE}
+    return head | {"rules": found, "log_odds": _log_odds_regression(marks), "settings": _recommended_settings(found)}
 
 
 def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
@@ -439,12 +439,8 @@ def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, f
 
 def _rounded(value: float, up: bool) -> float:
     """Return a number rounded up or down to two significant digits."""
-    if value == 0:
-        return 0.0
-    digits = 1 - math.floor(math.log10(abs(value)))
-    scaled = value * 10.0**digits
-    whole = math.ceil(scaled - 1e-9) if up else math.floor(scaled + 1e-9)
-    return round(whole / 10.0**digits, max(digits, 0))
+    context = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING if up else decimal.ROUND_FLOOR)
+    return float(context.create_decimal(f"{value:.10g}"))  # without the last digits, which are numerical errors
 
 
 _EVIDENCE_FORMAT = "yid-evidence/3"  # 2 had no chi2 of one fit to all recordings
