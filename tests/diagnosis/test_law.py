@@ -209,7 +209,7 @@ def test_a_configuration_has_a_law_by_its_table(tmp_path):
     assert made.parameters["law@T1.angle3"].value == pytest.approx(tables()[0].torque[3])
     for wrong, text in (
         ("{kind: law, location: T1}", "has no `law_csv`"),
-        (f"{{kind: kelvin_voigt, location: T1, law_csv: {file}}}", "`law_csv` and `depends_on` belong to kind: law"),
+        (f"{{kind: kelvin_voigt, location: T1, law_csv: {file}}}", "only an effect of kind: law has `law_csv`"),
     ):
         with pytest.raises(ConfigError, match=text):
             build_system(load_config(None, [f"model.effects=[{wrong}]"]))

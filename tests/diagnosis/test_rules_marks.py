@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
@@ -391,7 +391,7 @@ def written_slice(tmp_path, part, cases, **changes):
     known = dict.fromkeys(("code", "code_of_cases", "command"), "made up") | {"versions": {}, "candidates": {}}
     answers = [{"seconds": 1.0, "result": said("no_gap")} for _ in cases]
     found = {"slice": part, "cases": 4, "seed": 1, "purpose": "report", "configs": {}, "variations": {}, **known}
-    found |= {"labels": [label.to_dict() for label in labels], "answers": answers, "best": {}}
+    found |= {"labels": [asdict(label) for label in labels], "answers": answers, "best": {}}
     found["labels_sha256"] = labels_json_and_sha256(labels)[1]
     folder = tmp_path / part.replace("/", "-") / str(len(list(tmp_path.iterdir())))
     folder.mkdir(parents=True)

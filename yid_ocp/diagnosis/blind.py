@@ -74,11 +74,8 @@ def plan_blind_cases(
 
     `weights` holds the share of cases of each experiment. An experiment whose share is less than
     `_MIN_CASES_PER_EXPERIMENT` cases gets none; if this holds for all, the largest gets all. The category `finer_chain`
-    needs an experiment in `chains`. `seed` and `purpose` determine the order. Raises `ConfigError` if `count` < 1.
+    needs an experiment in `chains`. `seed` and `purpose` determine the order.
     """
-    if count < 1:
-        what, hint = f"the number of cases is {count}, but must be at least 1", "leave --cases out, or give more"
-        raise ConfigError(what, where="count (--cases)", allowed="a whole number from 1", hint=hint)
     total = sum(weights.values())
     kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
     kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}
@@ -150,13 +147,9 @@ class CaseGroundTruth:
     truth: Mapping[str, float]  # true values of the nominal parameters
     experiment: str = ""  # experiment of the case
 
-    def to_dict(self) -> dict[str, Any]:
-        """Convert the true effects and parameters to a JSON-compatible dictionary."""
-        return asdict(self)
-
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """Restore the true effects and parameters from a dictionary that `to_dict` returned."""
+        """Restore the true effects and parameters from a dictionary that `asdict` returned."""
         return CaseGroundTruth(**{**data, "injected": tuple(InjectedEffect(**entry) for entry in data["injected"])})
 
 
@@ -172,7 +165,7 @@ class UnlabelledCase:
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
     """Return the labels of cases as JSON text, and its SHA-256 hash, which is written before the diagnosis."""
-    text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
+    text = json.dumps([asdict(label) for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -231,9 +224,6 @@ class BlindCaseGenerator:
         if not self.simulated_system.driven or self.simulated_system.prescribed:
             what, allowed = "the arms have prescribed joints, or no driven ones", "driven joints alone"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
-        if seed < 0:
-            what, hint = f"the seed is {seed}, but must be at least 0", "set --seed 0 or more"
-            raise ConfigError(what, where="--seed", allowed="a whole number from 0", hint=hint)
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
@@ -498,10 +488,7 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
 
 
 def diagnose_unlabelled_case(
-    ensemble: BlindCaseGenerator,
-    case: UnlabelledCase,
-    candidates: CandidateNamesOrAll = "all",
-    thresholds: Thresholds = DEFAULT_THRESHOLDS,
+    ensemble: BlindCaseGenerator, case: UnlabelledCase, candidates: CandidateNamesOrAll, thresholds: Thresholds
 ) -> DiagnosisResult:
     """Diagnose a blind-test case from its recordings and excluded kinds of effects, without its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]

@@ -140,8 +140,6 @@ def run_blind(
 
 @dataclass(frozen=True)
 class _Proof:
-    """Settings of a blind validation, its folder and its workers."""
-
     whole: Path  # folder of the ensemble, of all its slices
     runs: Sequence[RunSettings]
     count: int
@@ -153,7 +151,6 @@ class _Proof:
 
     @property
     def folder(self) -> Path:
-        """Folder of this slice."""
         own, of = self.part
         return self.whole if of == 1 else self.whole / f"slice-{own}-of-{of}"
 
@@ -229,7 +226,7 @@ class _Proof:
             gap = found["result"]["verdict"] not in ("no_gap", "insufficient_data")
             if gap and label.category in ("single", "pair"):
                 arguments = {key: value for key, value in case.arguments.items() if key != "without"}
-                tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
+                tasks.append(Task(case.name, {**arguments, "label": asdict(label)}))
         best = self.done(_true_effect_closure, tasks, "best")
         return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
@@ -268,7 +265,7 @@ def _draw_case(
         "held_out": f"{case.held_out_recording.name}.h5",
         "without": list(case.excluded_kinds),
     }
-    return dict(to_json_types({"label": label.to_dict(), "case": told}))
+    return dict(to_json_types({"label": asdict(label), "case": told}))
 
 
 def _diagnose_case_from_recordings_task(
@@ -373,15 +370,12 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
 
 @dataclass(frozen=True)
 class _BlindExperiment:
-    """A virtual experiment of a blind ensemble: configuration file, variation, seed and purpose."""
-
     config_file: Path
     variation: str
     seed: int
     purpose: str
 
     def simulation_settings(self) -> RunSettings:
-        """Settings of the model that simulates the recordings."""
         overrides = EXPERIMENT_VARIATIONS[self.variation].simulation_overrides(self._virtual_arm)
         return load_config(self.config_file, overrides)
 
