@@ -364,10 +364,7 @@ class TimeHeatMapRow:
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> _Figure:
-    """Plot a heat map over J intervals with `edges` (J + 1,) [s]. Grey marks values without information.
-
-    `axis` is the title of the color scale.
-    """
+    """Plot a heat map over J intervals with `edges` (J + 1,) [s] and color scale `axis`. Grey: no information."""
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
     # even to the eye from one standard deviation to thousands

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from yid_ocp.analysis import step_diagnostics
@@ -28,6 +27,7 @@ from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
+from yid_ocp.workflow.prediction_outputs import store_texts
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
@@ -213,7 +213,6 @@ def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = "yid-linearisation/1"
         file.attrs["time_step"] = step.time_step
-        for key, texts in names.items():
-            file.attrs[key] = np.array(texts, dtype=h5py.string_dtype())
+        store_texts(file, names)
         for name in ("state", "torque", "A", "B_u", "B_theta"):
             file.create_dataset(name, data=arrays[name])

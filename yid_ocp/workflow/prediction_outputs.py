@@ -173,14 +173,14 @@ def write_solve_trajectories(
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = SOLVE_TRAJECTORIES_FORMAT
         unknowns = file.create_group("unknowns")
-        _store_texts(unknowns, {"names": solution.unknown_names})
+        store_texts(unknowns, {"names": solution.unknown_names})
         unknowns.create_dataset("x", data=solution.x)
         unknowns.create_dataset("covariance", data=solution.covariance)
         for role, episode, outcome in pairs:
             group, system = file.require_group("recordings").create_group(episode.name), problem.system
             group.attrs["role"] = role
             names = {"joints": system.mechanism.joint_names, "driven": system.driven, "prescribed": system.prescribed}
-            _store_texts(group, names)
+            store_texts(group, names)
             if isinstance(outcome, str):
                 group.attrs["message"] = outcome
                 continue
@@ -220,10 +220,10 @@ def write_diagnosis_hdf5(
             problem = result.nominal_model.problem
             group = file.create_group(f"where/{trace.recording}")
             group.attrs["start"] = next(e.grid.start_time for e in problem.episodes if e.name == trace.recording)
-            _store_texts(group, {"unknowns": trace.unknown_names})
-            _store_texts(group, {"locations": [source.location for source in trace.unknown_groups]})
-            _store_texts(group, {"kinds": [source.kind for source in trace.unknown_groups]})
-            _store_texts(group, {"units": smoothed_unknown_units(problem.system, trace)})
+            store_texts(group, {"unknowns": trace.unknown_names})
+            store_texts(group, {"locations": [source.location for source in trace.unknown_groups]})
+            store_texts(group, {"kinds": [source.kind for source in trace.unknown_groups]})
+            store_texts(group, {"units": smoothed_unknown_units(problem.system, trace)})
             variance = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
             relative = {"mean": trace.posterior_mean, "std": trace.posterior_std, "prior": np.sqrt(variance)}
             _store(group, {"edges": trace.interval_edges})
@@ -238,7 +238,7 @@ def _store_sensor(
     parent: h5py.Group, episode: Episode, samples: SensorMeasurements, predicted: Mapping[str, Array]
 ) -> None:
     group = parent.create_group(samples.sensor.group_name)
-    _store_texts(group, {"channels": samples.sensor.channel_names})
+    store_texts(group, {"channels": samples.sensor.channel_names})
     group.attrs["unit"] = samples.sensor.unit
     times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
     _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
@@ -249,6 +249,7 @@ def _store(group: h5py.Group, arrays: Mapping[str, ArrayLike]) -> None:
         group.create_dataset(name, data=array, compression="gzip", shuffle=True)
 
 
-def _store_texts(group: h5py.Group, texts: Mapping[str, Sequence[str]]) -> None:
+def store_texts(group: h5py.Group, texts: Mapping[str, Sequence[str]]) -> None:
+    """Store lists of texts as attributes of a group."""
     for name, values in texts.items():
         group.attrs[name] = np.array(values, dtype=h5py.string_dtype())

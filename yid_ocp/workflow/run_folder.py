@@ -47,10 +47,7 @@ class RunFolder:
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> str:
-        """Write config.yaml, hash the input files, and log the start of a command. Errors: `input_files_by_name`.
-
-        Returns the text of config.yaml.
-        """
+        """Write and return config.yaml, hash the inputs, and log a command's start. Errors: `input_files_by_name`."""
         write_text(self.path / "config.yaml", text := config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
