@@ -37,8 +37,6 @@ _MIN_INFORMED_FRACTION = 0.05  # relative fall of a prior's variance, below whic
 
 @dataclass(frozen=True)
 class _ParameterShift:
-    """Change of one parameter from the baseline to the current fit."""
-
     name: str
     unit: str
     baseline_value: float

@@ -252,7 +252,6 @@ class RefitContext:
         return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
-        """A result, which is recorded."""
         found = work()
         # a model's rollouts would fill the memory
         answers.setdefault(name, found.statistics() if isinstance(found, RefittedModel) else found)
@@ -487,9 +486,7 @@ def held_out_loss(
     return HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
 
 
-def held_out_rmse_and_unit_by_channel(
-    found: HeldOutPredictions,
-) -> dict[str, tuple[float, str]]:
+def held_out_rmse_and_unit_by_channel(found: HeldOutPredictions) -> dict[str, tuple[float, str]]:
     """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_count_dicts_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])

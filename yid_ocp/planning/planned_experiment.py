@@ -141,7 +141,6 @@ class SplineMotionExperiment:
 
     @cached_property
     def _points(self) -> list[tuple[SensorMeasurements, FramePositionEvaluator]]:
-        """Measurements of points, each with an evaluator of its frames."""
         system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
         seen = [samples for samples in measured if samples.sensor.point_names]
         return [(samples, FramePositionEvaluator(system, samples.sensor.frame_names)) for samples in seen]

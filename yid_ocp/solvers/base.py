@@ -319,8 +319,6 @@ def fit_problem(
 
 @dataclass(frozen=True)
 class _Fit:
-    """The fit from one start."""
-
     result: SolverResult
     evaluation: Evaluation  # at the end of the search
     weighted: EstimationProblem  # with whitening filters at the end of the search
@@ -416,7 +414,6 @@ class _MultiStartSearch:
         return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
     def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
-        """Solution of the best fit, with its uncertainty."""
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
         fit = assess_goodness_of_fit(problem, finish, limits)
         covariance = misfit_robust_covariance(problem, finish, fit)

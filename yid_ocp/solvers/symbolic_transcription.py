@@ -313,7 +313,6 @@ class _Maker:
         return gain, self._p.append_block(f"reference[{episode.name}]", feedback.reference.T, followed)
 
     def _driven(self, episode: Episode) -> _DrivenStage:
-        """The stage with the inputs of a recording."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
             feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_calculator

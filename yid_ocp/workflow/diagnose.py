@@ -329,7 +329,6 @@ class _SingleJsonFileRefitStore(RefitStore):
         return found
 
     def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit and rewrite the file."""
         with self._lock:
             self._known[name] = refitted
             try:
