@@ -55,7 +55,7 @@ def test_methods_agree_on_what_the_data_inform(problem):
     [
         ([-1.0, 0.2, 0.1], "elbow.stiffness = -1 N m/rad lies below its lower bound of 0 N m/rad"),
         ([4.0, math.nan, 0.1], "elbow.rest = nan is not a finite number"),
-        ([4.0], "1 values for 3 unknowns"),
+        ([4.0], "1 values are given for 3 unknowns"),
     ],
 )
 def test_a_start_beyond_a_bound_is_refused_by_name(problem, start, said):

@@ -88,7 +88,7 @@ def test_a_proportional_filter(step):
     np.testing.assert_array_equal(loop.reference, measured[:-1])
     np.testing.assert_array_equal(loop.state_indices, [0, 1])
     np.testing.assert_array_equal(proportional_tracking_feedback(step, measured, 5.0).gain, [np.diag([5.0, 5.0])] * 3)
-    with pytest.raises(ModelError, match=r"negative: -1 N m/rad"):
+    with pytest.raises(ModelError, match=r"-1 N m/rad is negative"):
         proportional_tracking_feedback(step, measured, [5.0, -1.0])
     with pytest.raises(ModelError, match="3 gains for 2 driven joints"):
         proportional_tracking_feedback(step, measured, [1.0, 2.0, 3.0])
@@ -96,7 +96,7 @@ def test_a_proportional_filter(step):
 
 def test_driven_joints_must_come_first(parts):
     step = compile_step(parts.cable(driven=["C_2_x"]), 0.01, use_compiler=False)
-    with pytest.raises(ModelError, match="come first"):
+    with pytest.raises(ModelError, match="come before the driven ones"):
         lqr_tracking_feedback(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())
 
 

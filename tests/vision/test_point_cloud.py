@@ -78,7 +78,7 @@ def test_where_the_object_can_be(system, run):
     ],
 )
 def test_options_are_checked(options, name):
-    with pytest.raises(ConfigError, match=f"{name} = -1"):
+    with pytest.raises(ConfigError, match=f"{name} is -1"):
         options(**{name: -1.0})
 
 

@@ -186,7 +186,7 @@ def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> 
         ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no cables yet"]),
         ((found, "--format", "csv"), ["a run folder cannot be written as CSV", "export a recording"]),
         ((recording, "--format", "mjcf"), ["the format mjcf needs a run folder", "solve"]),
-        ((broken,), ["result.json", "not JSON"]),
+        ((broken,), ["result.json", "not valid JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),
         ((found, "--lossy", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),

@@ -474,7 +474,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
 
 def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     proposed(moved(SHORT[:1]))
-    assert "joints has 1 of at least 4 samples" in capsys.readouterr().out
+    assert "joints has only 1 sample (at least 4 are needed)" in capsys.readouterr().out
 
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -188,7 +188,6 @@ class _LoggedProgress(Progress):
         self.shown.report_iterate(entry)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        return_freed_memory()
         self.folder.log_event("part", done=done, total=total, text=text)
         self.shown.report_parts_done(done, total, text)
 

@@ -234,7 +234,7 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
         slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds
         if unit and not slow and "t" not in units:
             units["t"] = unit
-            notes.append(f"samples come every {period:.3g}, so the times seem to be in {unit}")
+            notes.append(f"the time between samples is {period:.3g}, so the times seem to be in {unit}")
     return units, tuple(notes)
 
 
