@@ -36,15 +36,6 @@ def _dc_motor_joints(system: System) -> tuple[str, ...]:
     return tuple(name for name in base.servo_joint_names(system) if system.servos[name].motor_kind == "dc")
 
 
-def _published_motor_joints(system: System) -> tuple[str, ...]:
-    return tuple(name for name in _dc_motor_joints(system) if system.servos[name].torque_constant is not None)
-
-
-def _geared_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints with known effort or, if there are none, of joints with a servo."""
-    return _effort_joints(system) or base.servo_joint_names(system)
-
-
 def _limit_definition(lowest: float, unit: str, text: str) -> ParameterDefinition:
     """Definition of the parameter `tightness` = limit^-16. Reports show the limit, at least `lowest`, in `unit`."""
     highest, inverse = lowest**-TORQUE_SATURATION_EXPONENT, f"({unit})^-16"
@@ -117,7 +108,7 @@ class _Backlash(_DistortedReading):
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     required_excitation = "the force at its ends"
-    possible_locations = _geared_joints
+    possible_locations = lambda system: _effort_joints(system) or base.servo_joint_names(system)
     declared_parameters = (ParameterDefinition("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
 
     @classmethod
@@ -325,7 +316,7 @@ class _CurrentLimit(_ServoChange):
     """
 
     equation = "torque = kt clip(torque/kt, limit)"
-    possible_locations = _published_motor_joints
+    possible_locations = lambda system: tuple(j for j in _dc_motor_joints(system) if system.servos[j].torque_constant)
     declared_parameters = (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:

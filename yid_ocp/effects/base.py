@@ -209,6 +209,11 @@ def object_joint_names(system: System) -> tuple[str, ...]:
     return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
 
+def moving_frame_names(system: System) -> tuple[str, ...]:
+    """Return the names of all frames that a joint moves."""
+    return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
+
+
 def clamp_names(system: System) -> tuple[str, ...]:
     """Return the names of all floating clamps. A clamp NAME has the six joints `NAME_x` to `NAME_rz`."""
     names = set(system.mechanism.joint_names)

@@ -46,15 +46,13 @@ def _carried_body(system: System, joint: int) -> _CarriedBody:
 
 
 class _ScaledBodies(EffectBase):
-    """Masses and inertias of some bodies multiplied by a factor."""
+    """Masses and inertias of a segment, or of the link that an arm joint moves, multiplied by a factor."""
 
     required_excitation = "the acceleration"
 
-    def _joints(self, system: System) -> tuple[str, ...]:
-        raise NotImplementedError
-
     def apply_to_system(self, system: System) -> System:
-        joints, scale = self._joints(system), self["scale"]
+        links = {s.name: s.link_joints for s in system.segment_layouts}.get(self.location, ((self.location,),))
+        joints, scale = {joint for link in links for joint in link}, self["scale"]
         return base.system_with_changed_bodies(system, joints, lambda bodies: (b.scaled_by(scale) for b in bodies))
 
 
@@ -65,9 +63,6 @@ class _Density(_ScaledBodies):
     equation = "masses and inertias times scale"
     possible_locations = base.flexible_segment_names
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on mass and inertia"),)
-
-    def _joints(self, system: System) -> tuple[str, ...]:
-        return tuple(joint for link in system.find_segment_layout(self.location).link_joints for joint in link)
 
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
@@ -84,9 +79,6 @@ class _LinkMass(_ScaledBodies):
     possible_locations = _joints_with_mass
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.8, 1.2), "factor on mass and inertia"),)
 
-    def _joints(self, system: System) -> tuple[str, ...]:
-        return (self.location,)
-
 
 def system_with_mass_scale_parameters(system: System, name: str) -> System:
     """Return a copy with a parameter `JOINT.name` for each arm link, which scales the link's mass and inertia."""
@@ -98,10 +90,6 @@ def system_with_mass_scale_parameters(system: System, name: str) -> System:
     )
     parameters = system.parameters.with_added(factors.values())
     return replace(system, mechanism=replace(tree, joints=joints), parameters=parameters)
-
-
-def _moving_frames(system: System) -> tuple[str, ...]:
-    return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
 
 
 def _tips_and_link_ends(system: System) -> tuple[str, ...]:
@@ -117,7 +105,7 @@ class _PointMass(EffectBase):
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     required_excitation = "the acceleration"
     is_local = is_load = True
-    possible_locations = _moving_frames
+    possible_locations = base.moving_frame_names
     candidate_locations = _tips_and_link_ends
 
     @classmethod
@@ -156,7 +144,7 @@ class _Payload(EffectBase):
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     required_excitation = "the orientation to gravity"
     is_local = is_load = True
-    possible_locations = _moving_frames
+    possible_locations = base.moving_frame_names
     # payloads at two frames of one link are equivalent
     candidate_locations = base.one_frame_name_per_arm_link
 
@@ -245,17 +233,13 @@ def _length_names(system: System, segment: str) -> list[str]:
     return [name for name in system.parameters.names if name == own or name.startswith(f"{own}_")]
 
 
-def _segments_with_length(system: System) -> tuple[str, ...]:
-    return tuple(name for name in base.flexible_segment_names(system) if _length_names(system, name))
-
-
 @EFFECTS.register("length_scale")
 class _LengthScale(EffectBase):
     """Scale factor on the link lengths of a segment. Its mass is unchanged."""
 
     equation = "link lengths times scale"
     required_excitation = "the posture"
-    possible_locations = _segments_with_length
+    possible_locations = lambda system: [s for s in base.flexible_segment_names(system) if _length_names(system, s)]
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
     def apply_to_system(self, system: System) -> System:

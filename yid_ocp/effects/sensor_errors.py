@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_name_of_frame
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, moving_frame_names, segment_name_of_frame
 from yid_ocp.model.mechanism import Placement, symbolic_rotation_from_rpy
 from yid_ocp.model.system import NodeStateSymbols, System
 
@@ -133,18 +133,13 @@ _MOUNTED_COMPONENTS = {
 """By group of a recording: quantity, unit, bound and expected size of a bias."""
 
 
-def _mounted(system: System) -> tuple[str, ...]:
-    frames = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
-    return tuple(f"{group}:{frame}" for group in _MOUNTED_COMPONENTS for frame in frames)
-
-
 class _MountedSensorEffect(EffectBase):
     """The base class of errors of a wrist sensor or an inertial unit, at the location `wrist:FRAME` or `imu:FRAME`."""
 
     required_excitation = "the orientation to gravity"
     is_at_recorded_sensor = True
     is_local = True
-    possible_locations = _mounted
+    possible_locations = lambda system: [f"{g}:{f}" for g in _MOUNTED_COMPONENTS for f in moving_frame_names(system)]
 
     def _read(self, quantity: str, output: ca.SX) -> ca.SX:
         return output
