@@ -501,7 +501,8 @@ def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | N
     def control(k: int, now: float) -> None:
         if k % _INERTIA_EVERY == 0:
             mujoco.mj_forward(model, data)
-            _full_inertia(mujoco, model, data, inertia)
+            for column, unit in zip(inertia, np.eye(model.nv), strict=True):
+                mujoco.mj_mulM(model, data, column, unit)
         offset, velocity, _ = path.offset_and_derivatives(now)
         demand = REPLAY_FEEDBACK_BANDWIDTH**2 * (start + offset - data.qpos[at])
         demand += 2 * REPLAY_FEEDBACK_BANDWIDTH * (velocity - data.qvel[at])
@@ -522,14 +523,6 @@ def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: A
         scene.data.ctrl[:] = given[k]
 
     return _played(scene, t[-1], control)
-
-
-def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
-    """The mass matrix, with either argument order of MuJoCo versions."""
-    try:
-        mujoco.mj_fullM(model, data, full)
-    except TypeError:
-        mujoco.mj_fullM(model, full, data.qM)
 
 
 def _errors(
