@@ -272,9 +272,8 @@ LIMIT_VIOLATION_RATIO_CAP = 1e3
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
 """Smallest number of differences between samples from which a channel's noise is estimated."""
-LATE_POINTS_WORDS = (
-    "the points match the angles best if shifted by "  # of a note of merged files; the shift [s] follows
-)
+LATE_POINTS_WORDS = "the points match the angles best if shifted by "
+"""Words of a note of merged files; the shift [s] follows."""
 
 
 @dataclass(frozen=True)

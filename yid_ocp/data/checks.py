@@ -173,10 +173,8 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         if late * over > 0 and abs(shift) > slack:
             how = f"starts {abs(late):.3g} s and ends {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
             what = f"{group.name} {how} than the joints ({slack:.3g} s is tolerated at one of the two ends)"
-            advice = (
-                "if the clocks differ, import again with --clock-offset FILE=SECONDS, which are added to the times; "
-            )
-            advice += "if not, cut out the common time (Python: Recording.time_slice)"
+            advice = "if the clocks differ, import again with --clock-offset FILE=SECONDS, which are added to the times"
+            advice += "; if not, cut out the common time (Python: Recording.time_slice)"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif (
             len(recording.points) == 1  # a note does not say which of several groups is late
@@ -188,10 +186,10 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             late, lag = "late" if lag[0] == "-" else "early", lag.partition(":")[0]
             what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the object swings behind the arm"
             advice = (
-                f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. If they"
+                f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. If they "
             )
-            advice += f" are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, or let a"
-            advice, line = f"{advice} fit estimate it", f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
+            advice += f"are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, or let a "
+            advice, line = f"{advice}fit estimate it", f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=line)
 
 

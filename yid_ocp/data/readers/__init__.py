@@ -12,9 +12,8 @@ from pkgutil import iter_modules
 from typing import Any
 
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.readers.base import FILE_PREVIEWERS as FILE_PREVIEWERS
+from yid_ocp.data.readers.base import FILE_PREVIEWERS, FilePreview, TopicOrColumnSummary
 from yid_ocp.data.readers.base import READERS as READERS
-from yid_ocp.data.readers.base import FilePreview, TopicOrColumnSummary
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.display import NULL_PROGRESS, Progress

@@ -237,10 +237,8 @@ def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
         kind = schema.field(name).type
         while hasattr(kind, "value_field"):
             kind = kind.value_type
-        what, is_numeric = (
-            f"the column {name} contains {kind} instead of numbers",
-            is_integer(kind) or is_floating(kind),
-        )
+        is_numeric = is_integer(kind) or is_floating(kind)
+        what = f"the column {name} contains {kind} instead of numbers"
         hint = f"convert or record the dataset again, with numbers in {name}"
         raise_data_error_unless(is_numeric, what, where, "numbers, or lists of numbers", hint)
 
