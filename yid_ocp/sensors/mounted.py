@@ -50,8 +50,10 @@ class MountedSensor(base.Sensor):
 
 
 def register_class_of_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
-    """Register a reader for a class of mounted sensors. The reader makes one `SensorData` for each recorded group."""
-    base.SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
+    """Register the channel of a class of mounted sensors, and a reader that makes one `SensorData` for each group."""
+    key = f"{kind.channel.group}.{kind.channel.quantity}"
+    base.CHANNEL_KINDS.register(key)(kind.channel)
+    base.SENSOR_READERS.register(key)(partial(_read_sensors, kind=kind))
     return kind
 
 
@@ -148,9 +150,7 @@ _XYZ = ("x", "y", "z")
 class _Gyroscope(MountedSensor):
     """Angular velocity of a frame relative to the world, along the frame's axes."""
 
-    channel = base.CHANNEL_KINDS.register("imu.angular_velocity")(
-        base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
-    )
+    channel = base.RecordedChannelSpec("imu", "angular_velocity", "rad/s", _XYZ)
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics
@@ -161,9 +161,7 @@ class _Gyroscope(MountedSensor):
 class _Accelerometer(MountedSensor):
     """Acceleration of a frame's origin minus gravity, along the frame's axes. At rest it is 9.81 m/s^2 upwards."""
 
-    channel = base.CHANNEL_KINDS.register("imu.specific_force")(
-        base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)
-    )
+    channel = base.RecordedChannelSpec("imu", "specific_force", "m/s^2", _XYZ)
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         kinematics = state.kinematics

@@ -17,7 +17,7 @@ import casadi as ca
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.system import MidpointStateSymbols, NodeStateSymbols, System, six_joint_floating_mechanism
-from yid_ocp.sensors.base import CHANNEL_KINDS, RecordedChannelSpec
+from yid_ocp.sensors.base import RecordedChannelSpec
 from yid_ocp.sensors.mounted import MountedSensor, register_class_of_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
@@ -28,7 +28,7 @@ _N_LOCKED_JOINTS = 6
 class _WristForceSensor(MountedSensor):
     """Force that the part beyond the sensor exerts on it, along the sensor frame's axes."""
 
-    channel = CHANNEL_KINDS.register("wrist.force")(RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN))
+    channel = RecordedChannelSpec("wrist", "force", "N", _XYZ, _SIGN)
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[:3]
@@ -38,7 +38,7 @@ class _WristForceSensor(MountedSensor):
 class _WristTorqueSensor(MountedSensor):
     """Torque that the part beyond the sensor exerts on it about the origin of its frame, along the frame's axes."""
 
-    channel = CHANNEL_KINDS.register("wrist.torque")(RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN))
+    channel = RecordedChannelSpec("wrist", "torque", "N m", _XYZ, _SIGN)
 
     def _frame_reading(self, state: NodeStateSymbols, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[3:]
