@@ -16,10 +16,8 @@ from yid_ocp.errors import InsufficientMemoryError
 from yid_ocp.integrator.step import Step, compile_step, compile_step_like
 from yid_ocp.integrator.step_model import NewtonStatusCode, RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
-    EffectStepTerms,
     FlexibleSegment,
     Grasp,
-    Kinematics,
     Mechanism,
     Parameter,
     Parameters,
@@ -27,9 +25,9 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.kinematics import motion_cross_force_product, motion_cross_motion_product
+from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import ForceWithFactoredDerivatives, six_joint_floating_mechanism
+from yid_ocp.model.system import EffectStepTerms, ForceWithFactoredDerivatives, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 

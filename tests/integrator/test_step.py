@@ -12,9 +12,9 @@ import pytest
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatusCode
-from yid_ocp.model import EffectStepTerms, FlexibleSegment, Grasp, Parameters, System, flexible_object
+from yid_ocp.model import FlexibleSegment, Grasp, Parameters, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.system import six_joint_floating_mechanism
+from yid_ocp.model.system import EffectStepTerms, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]

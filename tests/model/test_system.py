@@ -9,19 +9,10 @@ import pytest
 from placed_frames import numbers
 
 from yid_ocp.errors import ConfigError, ModelError, YidError, nearest_name_question, unknown_name_error_arguments
-from yid_ocp.model import (
-    Effect,
-    FlexibleSegment,
-    Grasp,
-    Parameter,
-    Parameters,
-    System,
-    flexible_object,
-    forward_kinematics,
-)
+from yid_ocp.model import FlexibleSegment, Grasp, Parameter, Parameters, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import merge_inertias, rotation_from_rpy
 from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.system import six_joint_floating_mechanism
+from yid_ocp.model.system import Effect, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 

@@ -13,20 +13,10 @@ from virtual_examples import SYSTEMS, TRUTH, mujoco
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.export.models import export_support_by_effect
-from yid_ocp.model import (
-    Effect,
-    EffectStepTerms,
-    FlexibleSegment,
-    Grasp,
-    MidpointStateSymbols,
-    Parameter,
-    Parameters,
-    System,
-    flexible_object,
-)
+from yid_ocp.model import FlexibleSegment, Grasp, Parameter, Parameters, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.mechanism import Frame, Inertia, Placement
-from yid_ocp.model.system import six_joint_floating_mechanism
+from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.mjcf import CasadiEvaluator, mujoco_model_from_mjcf_text, mujoco_xml, system_joint_dynamics_terms
 

@@ -30,8 +30,7 @@ def foam_y_segments() -> tuple[FlexibleSegment, ...]:
 
 def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
     """Build the foam Y with its foot at (0.85, 0, -0.93) m. Joint stiffnesses do not depend on `links`."""
-    segments = [replace(segment, links=links) for segment in foam_y_segments()]
-    return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
+    return _FoamY(links=links, gravity_fraction=gravity_fraction).build(FlexibleSegment.damping)
 
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitialObjectSettings:
