@@ -156,10 +156,16 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        file = next((part for part in (path, *path.parents) if is_file(part)), None)
-        why = f"because {file} is a file" if file else f"({os_error_reason(error)})"
-        raise OutputError(f"{what} cannot be made {why}", where=str(path), hint="choose a writable folder") from error
+        raise folder_error(error, path, f"{what} cannot be made", "choose a writable folder") from error
     return path
+
+
+def folder_error(error: Exception, folder: Path, what: str, hint: str = "choose a writable --out") -> OutputError:
+    """Make an `OutputError` with the reason why a folder cannot be used, such as a file in its path."""
+    if (file := next((path for path in (folder, *folder.parents) if is_file(path)), None)) is not None:
+        what, hint = f"{what}, because {file} is a file", f"{hint}, or rename {file.name}"
+        return OutputError(what, where=str(folder), allowed="a path of folders, without a file among them", hint=hint)
+    return OutputError(f"{what}: {os_error_reason(error)}", where=str(folder), hint=hint)
 
 
 def is_file(path: Path) -> bool:

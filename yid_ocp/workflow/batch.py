@@ -20,14 +20,14 @@ from yid_ocp.analysis.run_estimates import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_question
-from yid_ocp.files import file_sha256, to_json_types, write_strict_json
+from yid_ocp.files import file_sha256, folder_error, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print, worker_config_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.run_folder import current_local_time_text, folder_error
+from yid_ocp.workflow.run_folder import current_local_time_text
 from yid_ocp.workflow.run_history import read_estimates, require_runs_of_one_model, run_drift_and_outliers_to_dict
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve

@@ -23,7 +23,7 @@ from yid_ocp import interruption
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.display import Progress
 from yid_ocp.errors import OutputError, YidError
-from yid_ocp.files import file_sha256, is_file, os_error_reason, to_json_types, write_text
+from yid_ocp.files import file_sha256, folder_error, os_error_reason, to_json_types, write_text
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
@@ -263,14 +263,6 @@ def _refusing(what: str, target: Path, hint: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise folder_error(error, target, f"the run folder cannot be {what}", hint) from error
-
-
-def folder_error(error: Exception, folder: Path, what: str, hint: str = "choose a writable --out") -> OutputError:
-    """Make an `OutputError` with the reason why a folder cannot be used, such as a file in its path."""
-    if (file := next((path for path in (folder, *folder.parents) if is_file(path)), None)) is not None:
-        what, hint = f"{what}, because {file} is a file", f"choose another --out, or rename {file.name}"
-        return OutputError(what, where=str(folder), allowed="a path of folders, without a file among them", hint=hint)
-    return OutputError(f"{what}: {os_error_reason(error)}", where=str(folder), hint=hint)
 
 
 def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
