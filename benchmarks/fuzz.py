@@ -342,7 +342,7 @@ def probe_frames(folder: Path, rng: Random) -> None:
     damage_folder(folder / "frames", rng)
     sequence = read_frames(folder / "frames")
     for index in range(len(sequence)):
-        sequence.load_world_cloud(index)
+        sequence.load_cloud(index)
 
 
 def probe_dataset(folder: Path, rng: Random) -> None:

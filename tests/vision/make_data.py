@@ -38,7 +38,7 @@ def main() -> None:
     pose, clouds = made.sequence.camera_pose, []
     true = [made.true_configuration_at(t) for t in made.capture_times]
     for i, q in enumerate(true):
-        points = made.sequence.load_world_cloud(i)
+        points = made.sequence.load_cloud(i) @ pose[:3, :3].T + pose[:3, 3]
         cloud = voxel_averages(points[region.membership_mask_function_at(q, pose[:3, 3])(points)], VOXEL)
         cloud = cloud.select(statistical_inlier_mask(cloud))
         cloud = cloud.select(~robot.within_surface_distance_mask(cloud.points, q, 0.03))

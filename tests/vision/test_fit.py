@@ -6,8 +6,8 @@ import pytest
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import ShapeFitOptions, ShapeFitter
-from yid_ocp.vision.fit import _Task
+from yid_ocp.vision import ShapeFitOptions
+from yid_ocp.vision.fit import ShapeFitter, _Task
 from yid_ocp.vision.shape_evidence import ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 

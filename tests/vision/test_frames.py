@@ -10,11 +10,10 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from yid_ocp import vision
 from yid_ocp.errors import DataError
 from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose, write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
-from yid_ocp.vision.frames import OcclusionMap
+from yid_ocp.vision.frames import XTION_INTRINSICS, OcclusionMap
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
 POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
@@ -33,7 +32,7 @@ def changed(folder, **entries):
 
 
 def test_depth_to_cloud_of_a_camera_of_58_degrees_and_another():
-    xtion = vision.XTION_INTRINSICS
+    xtion = XTION_INTRINSICS
     left, right = xtion.pixel_rays_at_unit_depth[240, 0], xtion.pixel_rays_at_unit_depth[240, -1]
     cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
     assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
@@ -53,7 +52,7 @@ def test_a_sequence_survives_the_disk(folder):
     assert np.array_equal(sequence.stamps, [0.5, 0.9])
     assert np.allclose(sequence.camera_pose, POSE)
     assert np.allclose(sequence.load_cloud(0), CLOUD, atol=1e-6)
-    assert np.allclose(sequence.load_world_cloud(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
+    assert np.allclose(sequence.load_cloud(1), CLOUD[:2], atol=1e-6)
     assert sequence.frame_names == ("000000.ply", "000001.ply")
 
 
@@ -125,7 +124,7 @@ def test_units_and_frames_of_clouds(folder):
     assert np.allclose(read_frames(folder).load_cloud(0), 1e-3 * CLOUD)
     assert np.allclose(read_frames(folder, unit="m").load_cloud(0), CLOUD, atol=1e-6)
     changed(folder, unit="m", frame="world")
-    assert np.allclose(read_frames(folder).load_world_cloud(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).load_cloud(0) @ POSE[:3, :3].T + POSE[:3, 3], CLOUD, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from yid_ocp.vision.point_cloud import (
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
-CAMERA = np.array([2.6, 0.0, 0.45])
+CAMERA, SKELETON = np.array([2.6, 0.0, 0.45]), SkeletonOptions()
 
 
 def test_voxels_keep_weight_and_centroid():
@@ -108,7 +108,7 @@ def from_bones(points):
 
 def test_nodes_and_edges_are_a_tree_on_the_centre_lines_from_the_lowest_point():
     cloud = letter()
-    found, again, other = (extract_skeleton_graph(cloud, np.random.default_rng(seed)) for seed in (0, 0, 2))
+    found, again, other = (extract_skeleton_graph(cloud, np.random.default_rng(seed), SKELETON) for seed in (0, 0, 2))
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
@@ -132,7 +132,7 @@ def test_two_parts_and_a_stray_heap():
     far = np.random.default_rng(3).normal([0.5, 0.5, 0.5], 0.01, (60, 3))
     near = np.abs(cloud.points[:, 2] - 0.4) > 0.15  # a gap across the trunk
     points = np.concatenate([cloud.points[near], far])
-    found = extract_skeleton_graph(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
+    found = extract_skeleton_graph(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0), SKELETON)
     assert set(found.component_of_node.tolist()) == {0, 1}
     assert not (found.node_of_point >= 0)[-60:].any()
     weights = np.bincount(found.component_of_node[found.node_of_point[found.node_of_point >= 0]])
@@ -141,10 +141,10 @@ def test_two_parts_and_a_stray_heap():
 
 def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it(monkeypatch):
     few = WeightedCloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
-    assert len(extract_skeleton_graph(few, np.random.default_rng(0)).nodes) == 0
-    empty = extract_skeleton_graph(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
+    assert len(extract_skeleton_graph(few, np.random.default_rng(0), SKELETON).nodes) == 0
+    empty = extract_skeleton_graph(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0), SKELETON)
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
-    found = extract_skeleton_graph(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0))
+    found = extract_skeleton_graph(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0), SKELETON)
     assert len(found.nodes) == 10
     assert (found.node_of_point >= 0).all()
     angle = np.arange(40)

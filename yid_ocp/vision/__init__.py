@@ -4,13 +4,10 @@ Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of 
 """
 
 from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions as ArmBasedCameraCalibrationOptions
-from yid_ocp.vision.calibration import CameraCalibration as CameraCalibration
 from yid_ocp.vision.calibration import CameraClockOptions as CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions as ShapeFitOptions
-from yid_ocp.vision.fit import ShapeFitter as ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder as write_frame_folder
 from yid_ocp.vision.frame_selection import TrackOptions as TrackOptions
-from yid_ocp.vision.frames import XTION_INTRINSICS as XTION_INTRINSICS
 from yid_ocp.vision.frames import CameraIntrinsics as CameraIntrinsics
 from yid_ocp.vision.frames import FrameSequence as FrameSequence
 from yid_ocp.vision.frames import look_at_pose as look_at_pose
@@ -21,7 +18,5 @@ from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.surface_meshes import SceneDescription as SceneDescription
 from yid_ocp.vision.surface_meshes import VirtualCameraSetup as VirtualCameraSetup
 from yid_ocp.vision.surface_meshes import VirtualCameraTiming as VirtualCameraTiming
-from yid_ocp.vision.surface_meshes import VirtualFramesWithTruth as VirtualFramesWithTruth
 from yid_ocp.vision.surface_meshes import render_virtual_frames as render_virtual_frames
-from yid_ocp.vision.track_result import FrameReport as FrameReport
 from yid_ocp.vision.track_result import TrackResult as TrackResult

@@ -390,19 +390,17 @@ class _Calibrator:
             words.append(f"clock drift {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")
         points = self.arm.visible_surface_points_and_parts(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
-        change = state.state_increment_from(self.told)
+        change, gap_text = state.state_increment_from(self.told), f"{1e3 * away:.0f} mm"
         if away > _MIN_REPORTED_DISPLACEMENT and self.options.fix_pose:
             slopes = state.world_point_jacobian_by_pose_and_depth(points)[0]
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = (
-                    f"the arm contradicts the fixed pose of the camera by {1e3 * away:.0f} mm, part of each point's std"
-                )
+                off = f"the arm contradicts the fixed pose of the camera by {gap_text}, part of each point's std"
                 words.append(f"{off} (to correct the pose, set track.options.calibration.fix_pose: false)")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
-            off = f"the camera at its specified pose sees the arm {1e3 * away:.0f} mm from its place by the joints"
+            off = f"the camera at its specified pose sees the arm {gap_text} from its place by the joints"
             moved = f"its pose is corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm"
             words.append(f"{off}; {moved}, its depth is {math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times the true one")
         return "; ".join(words)

@@ -177,10 +177,6 @@ class FrameSequence:
     def __len__(self) -> int:
         return len(self.frame_names)
 
-    def load_world_cloud(self, index: int) -> Array:
-        """Load a frame's cloud (N, 3) [m] in the world. Raises `DataError` if it cannot be read."""
-        return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
-
     @staticmethod
     def from_clouds(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike) -> FrameSequence:
         """Make a frame sequence from clouds (N, 3) [m] in the camera's frame, with stamps `t` (M,) [s]."""

@@ -296,12 +296,7 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, 
     return np.column_stack([forest.row, forest.col]).astype(np.int64), part.astype(np.int64)
 
 
-_DEFAULT_OPTIONS = SkeletonOptions()
-
-
-def extract_skeleton_graph(
-    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
-) -> CloudSkeleton:
+def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions) -> CloudSkeleton:
     """Extract the skeleton of a cloud, which is thinned from its lowest point on. Small connected parts are omitted."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
     edges, part = _spanning_forest(nodes, options)

@@ -475,8 +475,6 @@ class DepthCameraModel:
 
     def _shadow(self, depth: Array) -> BoolArray:
         """Pixels not lit by the projector, on the camera's left, because another surface of the image row is nearer."""
-        if self.baseline <= 0:
-            return np.zeros(depth.shape, bool)
         disparity = self.intrinsics.fx * self.baseline / depth
         height, width = depth.shape
         margin = math.ceil(float(disparity.max())) + 1

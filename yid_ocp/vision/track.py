@@ -258,9 +258,8 @@ class SingleFrameTracker:
         finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
-            raise DataError(
-                "the cloud has no finite points", where=where, allowed="finite x y z", hint="export it again"
-            )
+            what, allowed, hint = "the cloud has no finite points", "finite x y z", "export it again"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         far = float(np.median(np.abs(points[:: 1 + len(points) // _DISTANCE_SAMPLE_POINTS]).max(axis=1)))
         if far > _MAX_DISTANCE:
             what = f"the cloud is not in metres: half of its points are {far:.0f} m away or more"
