@@ -51,6 +51,7 @@ class NonparametricLaw:
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
     closure: HeldOutGapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the second best law
+    model: RefittedModel  # the fitted model with the law
     has_accepted_effects: bool  # whether the model also has accepted effects
 
     @property
@@ -158,7 +159,7 @@ def find_gap_law(
         names = best.law.knot_parameter_names(quantity)
         torque, std = (np.array([own[name] for name in names]) for own in (best.fit.values, best.fit.std))
         curves.append(TorqueLawTable(quantity, knots, torque, std))
-    return NonparametricLaw(best.law.location, tuple(curves), ranges, closure, runner_up, bool(last.effects))
+    return NonparametricLaw(best.law.location, tuple(curves), ranges, closure, runner_up, best.fit, bool(last.effects))
 
 
 @dataclass(frozen=True)
