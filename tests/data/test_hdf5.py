@@ -173,7 +173,7 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "group for dataset": (lambda f: [f["joints"].pop("effort"), f.create_group("joints/effort")], "not a dataset", ""),
     "text for numbers": (lambda f: f.create_dataset("points_arm/std", data=b"many"), "not a dataset of real", ""),
     "std twice": (lambda f: f["points_camera"].attrs.create("std", 1.0), "both a dataset and an attribute", ""),
-    "std no number": (lambda f: f["joints"].attrs.create("position_std", "small"), "not an array of real", ""),
+    "std no number": (lambda f: f["joints"].attrs.create("position_std", "small"), "not an array of numbers", ""),
     "truth no JSON": (lambda f: f.attrs.modify("truth", "T1.bend = 3"), "not JSON", ""),
     "truth no object": (lambda f: f.attrs.modify("truth", "[3]"), "not an object", ""),
     "truth no number": (lambda f: f.attrs.modify("truth", '{"a": true}'), "'a' is True", ""),

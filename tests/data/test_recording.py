@@ -26,7 +26,7 @@ def test_arrays_are_copied_and_read_only_and_not_ragged() -> None:
     with pytest.raises(ValueError, match="read-only"):
         group.t[0] = 5.0
     assert list(group.values_by_channel) == ["position", "effort"]
-    with pytest.raises(DataError, match="not an array of real numbers"):
+    with pytest.raises(DataError, match="not an array of numbers"):
         JointGroup(("a",), [0.0, 1.0], [[0.0], [1.0, 2.0]])  # type: ignore[arg-type]
 
 

@@ -392,7 +392,7 @@ def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     assert len(solver.runs) == 1
     assert problem.frozen == []
     assert solution.problem is problem
-    assert ("sensors' noise alone" in solution.message, solution.message[:7]) == (True, "run 1; ")
+    assert ("only the noise of sensors" in solution.message, solution.message[:7]) == (True, "run 1; ")
 
 
 def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_in_place_of_a_prediction():

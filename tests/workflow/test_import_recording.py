@@ -140,7 +140,7 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     assert (recording.point_names, recording.points[0].t[0]) == (("w_rod",), 0.5)
     for flags, what in (
         (["--columns", "x=skip"], "no file has a column 'x'"),
-        (["--episode", "1"], "no format of these files has the option"),
+        (["--episode", "1"], "--episode does not apply to files of these formats"),
     ):
         assert what in printed("import", *BOTH, "--out", "no.h5", "--units", "mm", *flags, code=2)
 

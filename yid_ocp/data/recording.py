@@ -375,7 +375,8 @@ def read_only_copy(value: ArrayLike, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        what, hint = "the value is not an array of real numbers", "write numbers only, in rows of equal length"
+        what = "the value is not an array of numbers with rows of equal length"
+        hint = "write an equal count of numbers in all rows"
         raise DataError(what, where=where, allowed="an array of real numbers", hint=hint) from error
     array.setflags(write=False)
     return array

@@ -148,7 +148,7 @@ class AllCandidatesProblem:
         held = [*held_out] or [episode.recording for episode in problem.held_out]
         if repeated := [own.name for own in held if any(_same(own, other) for other in estimate)]:
             what = f"recording '{repeated[0]}' is used both for the estimate and as held-out recording"
-            hint = "pass other recordings; without held-out ones, blocks of time of the recordings are held out"
+            hint = "pass other recordings, or none: then blocks of time of the recordings are held out"
             raise DataError(what, where="held_out, recordings.held_out", allowed="other recordings", hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]

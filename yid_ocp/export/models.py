@@ -145,7 +145,7 @@ _READING = FeatureExportSupport(
     "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}: correct the readings instead"
 )
 _NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is omitted")
-_UNUSED = FeatureExportSupport("native", "it has no influence on this model")
+_UNUSED = FeatureExportSupport("native", "the parameter has no influence on this model")
 
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:

@@ -275,7 +275,7 @@ def _drain(
                     name = type(error).__name__
                     text = "every worker that tried it ended abruptly" if name == "KilledWorker" else f"{name}: {error}"
                 result = None if text else _arrived(job, look is not None)
-                finished(job, result or TaskResult(job.task.name, error=text or "it left no result"))
+                finished(job, result or TaskResult(job.task.name, error=text or "its worker ended without a result"))
     except BaseException:
         for future in running:
             future.cancel()

@@ -391,7 +391,8 @@ def checked_unknowns(problem: EstimationProblem, values: ArrayLike, where: str) 
     """Return an unknown vector (nx,). Raises `ConfigError` for another number of values, or one beyond its bounds."""
     x, names, known = np.array(values, float).ravel(), problem.unknown_names, problem.system.parameters
     if len(x) != len(names):
-        what, hint = f"{len(x)} values are given for {len(names)} unknowns", "use problem.pack_unknowns({NAME: VALUE})"
+        what = f"{len(x)} values are given for {len(names)} unknowns"
+        hint = "pass problem.pack_unknowns({NAME: VALUE}), which adds the others"
         raise ConfigError(what, where=where, allowed=f"a value of each of {abbreviated_names_text(names)}", hint=hint)
     for name, value, lower, upper in zip(names, x.tolist(), *problem.bounds, strict=True):
         shared = name.partition("[")[0]

@@ -287,7 +287,8 @@ def _clamp_course(
     direction = _smoothed_point_path(recording, clamp.z_axis_point_name, grid, low_pass) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
-        what = f"points '{clamp.origin_point_name}' and '{clamp.z_axis_point_name}' of a clamp coincide in a frame"
+        names, at = (clamp.origin_point_name, clamp.z_axis_point_name), grid.node_times[int(np.argmin(length))]
+        what = f"points '{names[0]}' and '{names[1]}', which give a clamp's direction, coincide at {at:.4g} s"
         allowed, hint = "two points at least 1e-6 m apart", "choose other points for this clamp under model.object"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     d = direction / length

@@ -427,10 +427,10 @@ class _MultiStartSearch:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
         status, message = result.status, result.message
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
-            message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
+            message += "; only the noise of sensors is counted, not that of inputs that drive the motion"
         constant = any(episode.has_biases_treated_as_noise for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
-            message += "; weighted without the constant errors that sensors and clocks may have"
+            message += "; constant errors that sensors and clocks may have are not counted"
         if not finish.ok:
             return Status.FAILED, finish.message
         ended = result.stopped_at_noise_level or linearized_residual.is_stationary_point(

@@ -452,7 +452,8 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
-            what, hint = f"grasp '{grasp.name}' is compliant, which MuJoCo cannot express", "set its compliance to 0"
+            what = f"grasp '{grasp.name}' of the kind {grasp.kind} is compliant, which MuJoCo cannot express"
+            hint = f"leave out the effect grasp_compliance@{grasp.name}"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
         if value._is_zero_at_parameter_values(compliance):

@@ -300,7 +300,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
-                off = f"{1e3 * away:.0f} mm away, {1e3 * most:.0f} mm are allowed"
+                off = f"it is {1e3 * away:.0f} mm away ({1e3 * most:.0f} mm are allowed)"
                 made[k] = replace(frames[k], drop_reason=f"the object's root is not where other frames have it: {off}")
     return made
 

@@ -279,7 +279,7 @@ class SingleFrameTracker:
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
-                raise dropped_frame_error("the cloud has no colours, which track.options.filters.object_colours needs")
+                raise dropped_frame_error("the cloud has no colours: leave track.options.filters.object_colours out")
             inside[inside] = point_cloud.wanted_colour_mask(colours[finite][inside], filters.object_colours)
             if not inside.any():
                 raise dropped_frame_error("no point has a colour of track.options.filters.object_colours")

@@ -146,8 +146,8 @@ def _merged(
     known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
-            what, hint = f"no format of these files has the option '{name}'", f"leave {_flag(name)} out"
-            allowed = ", ".join(sorted(set().union(*known.values())))
+            what, hint = f"{_flag(name)} does not apply to files of these formats", f"leave {_flag(name)} out"
+            allowed = ", ".join(sorted(map(_flag, set().union(*known.values()))))
             raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint=hint)
     late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
     units = dict(options.get("units") or {})

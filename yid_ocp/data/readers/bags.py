@@ -543,7 +543,7 @@ def _positions(
         time, place = seconds(message), message.content.point
         if seen.setdefault((time, point), place) != place:
             what, where = f"point '{point}' has two positions at {time:g} s", f"{where}: {message.source}"
-            hint = "name the points of the two sources differently: --points SOURCE=POINT"
+            hint = "of two topics, rename one (--points TOPIC=POINT); of one topic, remove a message with this time"
             raise DataError(what, where=where, allowed="one position of a point at a time", hint=hint)
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))
