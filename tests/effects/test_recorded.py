@@ -103,6 +103,20 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 
 
+def test_a_problem_takes_gains_and_equilibria_from_one_of_the_same_arms(benches) -> None:
+    """Effects that add coordinates move the states of the arms; what is taken belongs to the states as they are now."""
+    bench = benches["driven"]
+    plain, full = (problem(bench, kinds, neutral=True, feedback="lqr") for kinds in ((), KINDS))
+    made = EstimationProblem(full.step, [recording(bench)], full.free, full.options, like=plain)
+    (first,), (own,), (other,) = (p.episodes for p in (plain, full, made))
+    assert other.tracking_feedback.gain is first.tracking_feedback.gain
+    assert list(other.tracking_feedback.state_indices) == list(own.tracking_feedback.state_indices)
+    assert own.tracking_feedback.gain == pytest.approx(first.tracking_feedback.gain, rel=1e-9, abs=1e-9)
+    assert other.equilibrium_guess == pytest.approx(own.equilibrium_guess, abs=1e-9)
+    one, two = (p.evaluate(p.initial_unknowns, derivatives=False) for p in (full, made))
+    assert two.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
+
+
 @pytest.mark.parametrize(("mode", "feedback"), CASES)
 def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback, benches) -> None:
     task = problem(benches[mode], KINDS, feedback=feedback)
