@@ -104,10 +104,11 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
 
 
 def test_a_problem_takes_gains_and_equilibria_from_one_of_the_same_arms(benches) -> None:
-    """Effects that add coordinates move the states of the arms; what is taken belongs to the states as they are now."""
+    """An effect that adds coordinates moves the states of the arms; what is taken belongs to the states as they are."""
     bench = benches["driven"]
-    plain, full = (problem(bench, kinds, neutral=True, feedback="lqr") for kinds in ((), KINDS))
-    made = EstimationProblem(full.step, [recording(bench)], full.free, full.options, like=plain)
+    plain, soft = problem(bench, (), feedback="lqr"), make_effect("junction_compliance", "w_T1", bench.system)
+    step = compile_step(bench.system.with_effects([soft]), H, use_compiler=False)
+    full, made = (EstimationProblem(step, [recording(bench)], plain.free, plain.options, like=p) for p in (None, plain))
     (first,), (own,), (other,) = (p.episodes for p in (plain, full, made))
     assert other.tracking_feedback.gain is first.tracking_feedback.gain
     assert list(other.tracking_feedback.state_indices) == list(own.tracking_feedback.state_indices)
