@@ -55,7 +55,7 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
         what = f"{span:.3g} s of data with {len(t)} samples need {steps:.3g} time steps of {time_step:g} s, too many"
         allowed = f"at most {_MAX_STEPS} time steps, and {_MAX_STEPS_PER_SAMPLE} per sample"
-        hint = "set a larger problem.time_step or a smaller problem.duration; if times are not in seconds, correct them"
+        hint = "check that times are in seconds and do not jump, or set a larger problem.time_step or smaller duration"
         raise DataError(what, where=f"problem.time_step, recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
