@@ -170,7 +170,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
         assert f"± {100 * known.std_planned:.2g} %" in words
     assert "searches from random motions" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
-    assert "with the parameters of the configuration" in words
+    assert "for the parameters of the configuration" in words
 
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
