@@ -1,10 +1,11 @@
 """How cost and memory grow: with variables, horizon, recordings, candidates, and what a second worker is worth.
 
-    python benchmarks/growth.py [AXIS ...] [--quick] [--largest N] [--json FILE] [--workers 1 2] [--cases 24]
+    python benchmarks/growth.py [AXIS ...] [--whole] [--quick] [--largest N] [--json FILE] [--workers 1 2] [--cases 24]
 
 Every point is measured in a process of its own: processor time of one evaluation with its derivatives (residual and
 Jacobian by six stiffnesses, what an iteration of Gauss-Newton costs in the main), and by how much the process grew
 beyond what it was before. Slopes are those of logarithms, so that 1 is linear growth; compilation is not counted.
+With `--whole` it is the command `yid-ocp solve` in place of one evaluation, with checks, intervals and report.
 
 `workers` solves the same problems with one process and with several. Its efficiency is work over what the processes
 were there for: the processor time of one process over that of several (what is done twice, and what they take from
@@ -16,7 +17,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -28,6 +31,7 @@ from unittest import mock
 
 import numpy as np
 
+from yid_ocp import cli
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis.diagnose import fit_nominal_model
@@ -47,12 +51,15 @@ CONFIG = REPOSITORY / "configs" / "single_arm_no_vision.yaml"
 RECORDING = REPOSITORY / "tests" / "data" / "clean" / "single_arm_no_vision_estimate.h5"
 ARM, TUBES, JOINTS = 7, 3, 3  # joints of the arm, tubes, joints of a link: n = 7 + 9 links
 VARIABLES: Mapping[bool, tuple[int, ...]] = {False: (25, 43, 79, 151, 295, 403), True: (16, 25)}
-HORIZONS: Mapping[bool, tuple[int, ...]] = {False: (500, 1000, 5000, 10_000, 50_000), True: (10, 40)}
+HORIZONS: Mapping[bool, tuple[int, ...]] = {False: (500, 1000, 5000, 10_000, 20_000, 50_000), True: (10, 40)}
 RECORDINGS: Mapping[bool, tuple[int, ...]] = {False: (1, 2, 5, 10, 20, 50), True: (1, 3)}
 CANDIDATES: Mapping[bool, tuple[int, ...]] = {False: (5, 10, 20, 40, 80), True: (1, 2)}
 CASES: Mapping[bool, int] = {False: 24, True: 2}
 DURATION = 5.0  # of the recording [s]
 MIB = 1024.0**2
+
+Point = Callable[[Sequence[str]], dict[str, float]]
+"""What is measured with given settings."""
 
 # -- what is measured -------------------------------------------------------------------------------------------------
 
@@ -99,6 +106,39 @@ def evaluation(settings: Sequence[str]) -> dict[str, float]:
     }
 
 
+def whole(settings: Sequence[str]) -> dict[str, float]:
+    """The command `yid-ocp solve`, imports apart, after one on a tenth of the motion that compiles."""
+    command = ["solve", str(CONFIG), "--quiet", *(part for own in settings for part in ("--set", own))]
+    problem = problem_of(settings)
+    with tempfile.TemporaryDirectory() as folder:
+        cli.main([*command, "--set", f"problem.duration={DURATION / 10}", "--out", f"{folder}/first"])
+        before = peak()
+        begun = time.process_time()
+        cli.main([*command, "--out", f"{folder}/run"])
+        cpu = time.process_time() - begun
+        assert (Path(folder) / "run" / "result.json").is_file()
+    steps = sum(episode.grid.steps for episode in problem.episodes)
+    return {"cpu": cpu, "memory": peak() - before, "variables": problem.system.n_coordinates, "steps": steps}
+
+
+def side_by_side(counts: Sequence[int]) -> list[dict[str, float]]:
+    """Wall time of so many `yid-ocp solve` at once: with one thread each, with all, and one after the other."""
+    found = []
+    for count in counts:
+        point = {"commands": float(count)}
+        for key, environment in (("one_thread", {"YID_OCP_THREADS": "1"}), ("all_threads", {})):
+            with tempfile.TemporaryDirectory() as folder:
+                begun = time.monotonic()
+                command = [sys.executable, "-m", "yid_ocp", "solve", "--quiet", "--out"]
+                own = {**os.environ, **environment}
+                runs = [subprocess.Popen([*command, f"{folder}/{k}"], env=own) for k in range(count)]
+                assert not any(run.wait() for run in runs)
+                point[key] = time.monotonic() - begun
+        found.append(point)
+    keys = ("one_thread", "all_threads")
+    return [point | {f"{key} / alone": point[key] / found[0][key] for key in keys} for point in found]
+
+
 def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     """The composed problem of so many candidates, and one sweep of all their sensitivities."""
     problem = problem_of(settings)
@@ -143,30 +183,30 @@ def alone(function: Callable[..., dict[str, float]], *arguments: Any) -> dict[st
         return pool.submit(function, *arguments).result()
 
 
-def variables(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
-    return [alone(evaluation, settings_of((n - ARM) // (TUBES * JOINTS), quick)) for n in sizes]
+def variables(sizes: Sequence[int], quick: bool, what: Point) -> list[dict[str, float]]:
+    return [alone(what, settings_of((n - ARM) // (TUBES * JOINTS), quick)) for n in sizes]
 
 
-def horizon(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
+def horizon(sizes: Sequence[int], quick: bool, what: Point) -> list[dict[str, float]]:
     """More steps by finer ones: the recording is the same."""
     found = []
     for steps in sizes:
         step = (0.1 if quick else DURATION) / steps
-        found.append(alone(evaluation, settings_of(1 if quick else 4, quick, step=step)))
+        found.append(alone(what, settings_of(1 if quick else 4, quick, step=step)))
     return found
 
 
-def recordings(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
+def recordings(sizes: Sequence[int], quick: bool, what: Point) -> list[dict[str, float]]:
     found = []
     with tempfile.TemporaryDirectory() as folder:
         files = [_another(i, Path(folder)) for i in range(max(sizes))]
         for count in sizes:
-            point = alone(evaluation, settings_of(1 if quick else 4, quick, files[:count]))
+            point = alone(what, settings_of(1 if quick else 4, quick, files[:count]))
             found.append(point | {"recordings": count})
     return found
 
 
-def candidates(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
+def candidates(sizes: Sequence[int], quick: bool, _: Point) -> list[dict[str, float]]:
     return [alone(screening, settings_of(1 if quick else 4, quick), count) for count in sizes]
 
 
@@ -181,7 +221,7 @@ def _another(number: int, folder: Path) -> Path:
     return path
 
 
-Measure = Callable[[Sequence[int], bool], list[dict[str, float]]]
+Measure = Callable[[Sequence[int], bool, Point], list[dict[str, float]]]
 AXES: Mapping[str, tuple[Measure, str, Mapping[bool, tuple[int, ...]]]] = {
     "variables": (variables, "variables", VARIABLES),
     "horizon": (horizon, "steps", HORIZONS),
@@ -243,6 +283,10 @@ def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[s
                 (str(int(p["workers"])), f"{p['cpu']:.3g}", f"{p['occupied']:.2f}", f"{p['efficiency']:.2f}")
                 for p in points
             ]
+        elif axis == "side_by_side":
+            keys = ("one_thread", "one_thread / alone", "all_threads", "all_threads / alone")
+            rows = [("commands at once", *(f"wall, {key}" for key in keys))]
+            rows += [(f"{p['commands']:g}", *(f"{p[key]:.3g}" for key in keys)) for p in points]
         else:
             by = AXES[axis][1]
             rows = [(by, "CPU [s]", "memory [MiB]")]
@@ -256,8 +300,9 @@ def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[s
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print and store."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    known = [*AXES, "workers"]
+    known = [*AXES, "workers", "side_by_side"]
     parser.add_argument("axes", nargs="*", metavar="AXIS", help=f"of {', '.join(known)}; all when absent")
+    parser.add_argument("--whole", action="store_true", help="measure whole commands in place of evaluations")
     parser.add_argument("--quick", action="store_true", help="small models without a compiler: whether it runs at all")
     parser.add_argument("--largest", type=float, default=math.inf, help="leave larger points of an axis out")
     parser.add_argument("--json", type=Path, metavar="FILE", help="store points and slopes")
@@ -269,13 +314,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"there is no axis '{unknown[0]}'; choose from {', '.join(known)}")
     found: dict[str, list[dict[str, float]]] = {}
     slopes: dict[str, dict[str, float]] = {}
+    what = whole if chosen.whole else evaluation
     for axis in [name for name in known if name in chosen.axes or not chosen.axes]:
         print(f"{axis} ...", file=sys.stderr, flush=True)
+        if axis == "side_by_side":
+            found[axis] = side_by_side((1,) if chosen.quick else (1, 2, 5))
+            continue
         if axis == "workers":
             found[axis] = efficiency(chosen.workers, chosen.cases or CASES[chosen.quick], chosen.quick)
             continue
         measure, by, sizes = AXES[axis]
-        found[axis] = measure([size for size in sizes[chosen.quick] if size <= chosen.largest], chosen.quick)
+        found[axis] = measure([size for size in sizes[chosen.quick] if size <= chosen.largest], chosen.quick, what)
         slopes[axis] = {of: slope(found[axis], by, of) for of in ("cpu", "memory")}
     if chosen.json is not None:
         kept = {axis: {of: value for of, value in own.items() if math.isfinite(value)} for axis, own in slopes.items()}
