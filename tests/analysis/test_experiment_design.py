@@ -314,14 +314,14 @@ def driven(urdf_folder):
     return EstimationProblem(step, [Recording(group, (camera,), name="run")], ("T1.bend",), ProblemOptions())
 
 
-BEYOND = "it exceeds the range of shoulder, elbow", "it exceeds the torque limit of elbow"
+BEYOND = tuple(f"the simulated motion exceeds the {it}" for it in ("range of shoulder, elbow", "torque limit of elbow"))
 
 
 @pytest.mark.parametrize(
     ("name", "factor", "q", "effort", "note"),
     [
         ("motion", 1.0, (0.04, 0.0), (0.09, -0.04), ()),
-        ("travel", 2.0, (0.06, 0.0), (0.0, 0.0), ("it exceeds the range of shoulder",)),
+        ("travel", 2.0, (0.06, 0.0), (0.0, 0.0), ("the simulated motion exceeds the range of shoulder",)),
         ("motion", 1.0, (0.06, -0.06), (0, -0.06), BEYOND),
     ],
 )

@@ -302,7 +302,7 @@ HELD = {
     "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
     "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
     "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 are exchanged"),
-    "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "and no simple change explains this"),
+    "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "and no change of unit, axes, names, frame, clock or joint zero"),
 }
 # millimetres, centimetres, inches, decimetres and feet, and read as such
 for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
@@ -568,7 +568,7 @@ def hanging(seed: int = 0) -> Recording:
         (
             lambda p: p[:, [0, 1, 2, 10, 4, 5, 6, 7, 8, 9, 3, 11]],
             "point_swapped",
-            "a2 to a3 has 3.45 times its undeformed length (1/1.6 to 1.6 times is tolerated). If a2 and p3 are exch",
+            "3.45 times as far apart as in the undeformed object (0.625 to 1.6 times is tolerated). If a2 and p3",
             3.45 / 1.6,
         ),
     ],

@@ -207,7 +207,7 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     left = [note for note in recording.notes if "was left out (" in note]
     assert [note.split()[0] for note in left] == ["/gripper/closed", *(f"/log/{name}" for name in "abcdef")]
     assert left[0].endswith("(10 of std_msgs/msg/Bool)")
-    assert any("of /tf:middle, /vrpn/hand/pose, the orientations" in note for note in recording.notes)
+    assert any("of /tf:middle, /vrpn/hand/pose, the orientations were not" in note for note in recording.notes)
     write_recording(recording, tmp_path / "all.h5")
     assert read_any(tmp_path / "all.h5").notes == recording.notes
     by_itself = read_any(path)

@@ -162,9 +162,9 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
-    said = "With twice the links, these estimates change by more than their ± from the data: p.a by -5.5 (±"
-    at, rest = lines.index(said), "With half the time step, no estimate changes by more than its ± from the data."
-    assert lines[at + 1 : at + 3] == ["0.073). The remedy is more links.", rest]
+    said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
+    at, rest = lines.index(said), "With half the time step, no estimate would change by more than its ± from the recordings (good)."
+    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
     assert lines.index("it snaps") < at
     moved = {name: own | {"links": None} for name, own in moved.items()}
     assert not any("twice the links" in line for line in told("yid-solve/1", solved(discretisation=moved)))
@@ -205,7 +205,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     assert "No set of up to three changes makes it possible to find all parameters." in lines
     assert "None of 1 parameters can be found" in lines[-1]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
-    assert "can be found with these changes, the fewest: a weld." in told("yid-identifiability/1", result)[-2]
+    assert "changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)[-2]
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():

@@ -405,7 +405,7 @@ class ExperimentVariantSensitivityBuilder:
         low, high, most = np.array([(joint.lower_limit, joint.upper_limit, joint.effort_limit) for joint in limits]).T
         beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque limit": np.abs(run.effort).max(0) > most}
         names = {what: ", ".join(np.array(system.driven)[over]) for what, over in beyond.items() if over.any()}
-        notes = [f"it exceeds the {what} of {joints_beyond}" for what, joints_beyond in names.items()]
+        notes = [f"the simulated motion exceeds the {what} of {joints_beyond}" for what, joints_beyond in names.items()]
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[_MeasurablePoint], torque: bool) -> Recording:

@@ -390,7 +390,9 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    rest, grasp = "begin them at rest, with problem.initial_state: equilibrium", "measure the position of the grasp"
+    rest = "begin recordings at rest, with problem.initial_state: equilibrium"
+    places = {name.partition("@")[2].rpartition(".")[0] for name in others if name.startswith(_GRASP_OFFSET_PREFIX)}
+    grasp = f"measure the position of grasp {', '.join(sorted(places))}: without --unknown-grasp, it counts as known"
     start = f"another initial state; {rest}", "start."
     for words, prefix in (start, (f"another position of the grasp; {grasp}", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]

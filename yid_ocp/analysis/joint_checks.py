@@ -407,8 +407,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require, which is "
-            words += f"{off:.3g} standard deviations from 1 ({_MIN_Z:g} are tolerated)"
+            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require. The "
+            words += f"ratio is {off:.3g} of its standard deviations away from 1 ({_MIN_Z:g} are tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)

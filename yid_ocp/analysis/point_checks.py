@@ -106,7 +106,7 @@ def _explained(
         words = f"{words}, but only {chosen.error:.2g} m {chosen.words}"
         place = recording, "joints" if chosen.channel else group, chosen.channel
         return Issue(chosen.cause, words, "not_trusted", error / allowed, chosen.advice, *place, setting=chosen.setting)
-    words = f"{words}, and no simple change explains this"
+    words = f"{words}, and no change of unit, axes, names, frame, clock or joint zero explains this"
     advice = "check the frame and the names of the points, and the URDF of the robot"
     return Issue("point_unlike", words, "not_trusted", error / allowed, advice, recording, group)
 
@@ -337,11 +337,11 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
         if left < least:
             best, least = (one, two), left
     worst = int(np.argmax(np.abs(np.log(ratio))))
-    words = f"the edge {edges[worst][0]} to {edges[worst][1]} has {ratio[worst]:.3g} times its undeformed length "
-    words += f"(1/{_MAX_EDGE_RATIO:g} to {_MAX_EDGE_RATIO:g} times is tolerated)"
+    words = f"the neighbours {edges[worst][0]} and {edges[worst][1]} are {ratio[worst]:.3g} times as far apart as "
+    words += f"in the undeformed object ({1 / _MAX_EDGE_RATIO:.3g} to {_MAX_EDGE_RATIO:g} times is tolerated)"
     cause, advice = "point_reach", "check the names of the points"
     if least < 0.5 * off.sum():
-        words += f". If {best[0]} and {best[1]} are exchanged, {int(off.sum()) - least} more edges are right"
+        words += f". If {best[0]} and {best[1]} are exchanged, {int(off.sum()) - least} more such distances are right"
         cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
     return Issue(cause, words, "not_trusted", max(ratio[worst], 1 / ratio[worst]) / _MAX_EDGE_RATIO, advice, "")
 

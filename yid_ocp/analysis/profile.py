@@ -232,10 +232,10 @@ class _Walk:
             ahead = math.inf if near else gone * (_TARGET_HEIGHT / height - 1.0) * _STEP_OVERSHOOT
             step = min(max(ahead, 0.2 * gone), _MAX_STEP_GROWTH * gone) if barrier is None else 0.5 * abs(barrier - s)
         if barrier is None:
-            self.notes.append(f"the interval is open {side}: {_MAX_PROFILE_POINTS} refits did not reach its end")
+            self.notes.append(f"{_MAX_PROFILE_POINTS} fits did not find the end of the interval {side} the value")
         else:
             why = f"the model cannot be simulated {side} {self._value(barrier):.4g}"
-            self.notes.append(f"the interval is open {side}, because {why}")
+            self.notes.append(f"the end of the interval {side} the value is unknown, because {why}")
         return None
 
     def rise(self, value: float) -> float:

@@ -76,7 +76,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             continue  # no effort was recorded, or it is cut off: other causes
         if evidence >= 1:
             start, stop, least = float(t[begin]), float(t[end]), QUALITY_LIMITS.min_stuck_samples
-            what = f"{channel} repeats one value for {stop - start:.3g} s"
+            what = f"{channel} repeats one value from {start:.4g} to {stop:.4g} s"
             what += f", {count} times (fewer than {least} are tolerated)" if is_unlikely else ""
             if turned > unseen:
                 what += f", although its velocity means a rotation by {turned:.2g} rad ({unseen:g} rad is tolerated)"

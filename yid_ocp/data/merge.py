@@ -103,11 +103,11 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         at_zero = _motion_lag(joints, t, path, period, 0.0, reach=0.0)
     if shared:
         if best is None or best.explained < _MIN_EXPLAINED or abs(best.lag) < _MIN_SAID_LAG:
-            return 0.0, said
+            return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
             share = f"which explains {best.explained:.0%} of their motion"
-            said += f"; but {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): either its clock is wrong, or the "
-            said += "object swings behind the arm. `yid-ocp check` says how to decide; for a clock, import "
+            said += f", so nothing was shifted; but {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): their clock is "
+            said += "off, or the object swings behind the arm. `yid-ocp check` says how to decide; for a clock, import "
             said += f"again with this option (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:

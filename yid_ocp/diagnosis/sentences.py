@@ -44,7 +44,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
             (rivals, f"Record a motion in which {aspects[0]}{at} varies over a wider range."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
-            return told[0]
+            return f"{told[0]} It can separate {abbreviated_names_text([effect.label for effect in rivals])}."
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
     mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " moves most.")
     texts = {
@@ -76,8 +76,8 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
     where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
     told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
-    check = "If you did not cause them, check these times."
-    text += [_listed("Brief disturbances were removed before the tests: ", told, f". {check}")]
+    check = "If you did not push the arm on purpose, look at the recordings at these times."
+    text += [_listed("The tests leave out these brief disturbances: ", told, f". {check}")]
     text += [*overspeed_truncation_messages(result), f"Next experiment: {result.next_experiment}"]
     return "\n".join(filter(None, text))
 
@@ -231,7 +231,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
     mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
     effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
     who = f"On held-out motions, the error of the {f'model with {effects}' if effects else 'nominal model'} is"
-    said = "within noise and the uncertainty of the parameters"
+    said = "no larger than noise and the uncertainty of the parameters explain"
     if result.remaining_test.p_value < result.thresholds.significance_level:
         said = f"{', '.join(worst.values())} (rms, noise subtracted){mostly}"
     changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
@@ -240,7 +240,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    change = _listed("If the effects are in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
+    change = _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
     return [f"{who} {said}.", change]
 
 

@@ -144,8 +144,8 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 _READING = FeatureExportSupport(
     "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}: correct the readings instead"
 )
-_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing and is omitted")
-_UNUSED = FeatureExportSupport("native", "the parameter has no influence on this model")
+_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing at this value, so the file omits it")
+_UNUSED = FeatureExportSupport("native", "no motion or force of this model depends on it, so nothing is lost")
 
 
 def export_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FeatureExportSupport]:

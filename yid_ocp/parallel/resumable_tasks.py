@@ -125,7 +125,7 @@ def run_tasks(
     def finished(job: _Job, result: TaskResult) -> None:
         found[job.key] = result
         if result.error:
-            log.warning("%s failed: %s", result.name, result.error)
+            log.warning("%s failed. The others go on; the same command tries it again. %s", result.name, result.error)
         if progress is not None:
             progress(len(found), len(unique), result.name)
 
@@ -275,7 +275,8 @@ def _drain(
                     name = type(error).__name__
                     text = "every worker that tried it ended abruptly" if name == "KilledWorker" else f"{name}: {error}"
                 result = None if text else _arrived(job, look is not None)
-                finished(job, result or TaskResult(job.task.name, error=text or "its worker ended without a result"))
+                text = text or "its worker left no result file, perhaps because it does not share this folder"
+                finished(job, result or TaskResult(job.task.name, error=text))
     except BaseException:
         for future in running:
             future.cancel()

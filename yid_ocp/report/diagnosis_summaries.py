@@ -307,8 +307,9 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
-        words = f"Do not use values by {', '.join(methods)}: they ignore noise of the inputs that move the model"
-        yield f"{words}. Use the column `solve`, which includes this noise. The verdicts are for this column."
+        words = "these methods ignore noise of the measured torques or angles that move the model"
+        yield f"Do not use the columns {' and '.join(methods)}, because {words}."
+        yield "Use the column `solve`, which includes this noise. The verdicts belong to it."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]

@@ -230,15 +230,18 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
-        rows = [("change", "found", "gain [nat]", "note")]
+        rows = [("change", "found", "gain [nat]")]
+        yield "Gain: information on all parameters. 0.7 nat more halves the standard deviation of one parameter."
         changes = {own["words"]: own for own in (asked["base"], *asked["singles"], *asked["smallest"])}
         for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
-            rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
+            count = f"{entry['identifiable']} of {len(parameters)}" if entry["gain"] is not None else "unknown"
+            rows.append((entry["words"], count, gain))
         yield SummaryTable(rows, "What another experiment would identify")
+        yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
         said = "No set of up to three changes makes it possible to find all parameters."
         if asked["smallest"]:
-            said = f"All parameters can be found with these changes, the fewest: {asked['smallest'][0]['words']}."
+            said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
     text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
@@ -326,16 +329,17 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f", which ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
+    others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
     more = f"It is the best of {len(starts)} searches from random motions{others}."
-    yield f"The search raised the information of the motion by {best['value'] - best['first']:.3g} nat. {more}"
-    reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"The motion reaches the limits: {'; '.join(reached)}." if reached else "The motion stays within all limits."
+    gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
+    yield f"The search raised the information of the motion by {gain}. {more}"
+    reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
+    yield f"The motion reaches {'; '.join(reached) or 'none of its limits'}."
     yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
-        yield "The information holds for the parameters of the configuration. With other true values it changes."
+        yield "The forecast holds for the configured initial values. For estimates, set plan.parameter_run_folder."
 
 
 @register_summary("yid-check/1")
@@ -368,7 +372,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
-    yield "Test of links and time steps at the initial values (`solve` repeats it at its estimates):" if moved else ""
+    yield "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)" if moved else ""
     yield from moved
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
@@ -517,8 +521,9 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     }
     grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
     entries = (manifest["effects"] | grasps | listed).items()
-    rows: TableRows = [("of the model", "in the file", "how, or why not")]
-    yield SummaryTable([*rows, *((name, entry["status"], entry["how"]) for name, entry in entries)])
+    rows: TableRows = [("part of the model", "in the file", "element of the file, or reason")]
+    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
+    yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
     gate = manifest["gate"]
     if gate is None:
         return

@@ -180,18 +180,18 @@ def misfit_summary_blocks(
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    noise = ("encoder_noise", "more encoder noise", "a lower problem.path_cutoff")
-    step = ("time_step", "half the time step", "a shorter problem.time_step")
-    for key, words, remedy in (("links", "twice the links", "more links"), step, noise):
+    noise = ("encoder_noise", "more encoder noise", "lower problem.path_cutoff")
+    step = ("time_step", "half the time step", "shorten problem.time_step")
+    for key, words, remedy in (("links", "twice the links", "set more links in model.object"), step, noise):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
-            text = f"With {words}, these estimates change by more than their ± from the data: "
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The remedy is {remedy}.")
+            text = f"With {words}, these estimates would change by more than their ± from the recordings: "
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. To cure this, {remedy}.")
         elif tried:
-            said.append(f"With {words}, no estimate changes by more than its ± from the data.")
+            said.append(f"With {words}, no estimate would change by more than its ± from the recordings (good).")
     return said
 
 

@@ -427,17 +427,17 @@ class _MultiStartSearch:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
         status, message = result.status, result.message
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
-            message += "; only the noise of sensors is counted, not that of inputs that drive the motion"
+            message += "; weights and ± ignore noise of the torques or angles that move the model (use gauss_newton)"
         constant = any(episode.has_biases_treated_as_noise for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
-            message += "; constant errors that sensors and clocks may have are not counted"
+            message += "; its weights ignore constant errors of sensors and clocks (gauss_newton includes them)"
         if not finish.ok:
             return Status.FAILED, finish.message
         ended = result.stopped_at_noise_level or linearized_residual.is_stationary_point(
             self._best.weighted, result.x, finish
         )
         if status == Status.CONVERGED and not ended:
-            stopped = f"the search stopped where a further step would lower the cost ({message})"
+            stopped = f"no minimum, because a further step would lower the cost ({message}); do not use the values"
             return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use gauss_newton"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 
@@ -559,7 +559,7 @@ class _RelinearizingSearch:
             x, self.evaluation = found.x, found.evaluation or now
         self.evaluation = self.weighted.evaluate(x, equilibrium_guesses=guesses)
         status = Status.CONVERGED if length < 10 * _LAST_STEP_STDS else Status.ITERATION_LIMIT
-        return ended(status, f"a step of {length:.2g} standard deviations ended {_MAX_LINEARIZATIONS} linearizations")
+        return ended(status, f"the last of {_MAX_LINEARIZATIONS} linearizations moved the unknowns by {length:.2g} std")
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:

@@ -100,7 +100,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 recorder.record_iterate(now.cost, x, slope)
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
-                    last = f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together"
+                    last = f"the last {_PATIENCE_STEPS} steps together lowered the cost by only {saved:.2g}"
                     message = f"{last} and moved nothing by a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
@@ -127,7 +127,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
                     slope = max_abs_projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
-                    return ended(base.Status.CONVERGED, "the step is below its tolerance")
+                    return ended(base.Status.CONVERGED, "the last step is below solver.step_tolerance")
                 continue
             # the parabola through both costs with the slope of the first has its minimum at this fraction of the step
             slope = float(residual @ (jacobian @ step))
@@ -138,7 +138,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)
                 message = f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
-                message += "start nearer to the solution, shorten the recording, or use multiple_shooting"
+                message += "set other parameters.NAME.initial, shorten the recording, or use multiple_shooting"
                 return ended(base.Status.STALLED, message)
 
 
@@ -221,7 +221,9 @@ class SingleShooting(base.SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
-        return recorder.solver_result_with_iterates(status, str(result.message).lower(), best.x, warm)
+        words = {0: "the cost no longer falls", 1: "no convergence; raise solver.max_iterations"}
+        message = words.get(result.status, f"{str(result.message).lower()}: no minimum was found; use gauss_newton")
+        return recorder.solver_result_with_iterates(status, message, best.x, warm)
 
 
 @base.SOLVERS.register("steepest_descent")

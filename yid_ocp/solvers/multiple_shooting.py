@@ -164,13 +164,13 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[base.Status, str]:
-        closed = f"with a largest defect of {defect:.1e}"
+        closed = f"the largest jump between time steps (defect) is {defect:.1e}, and should be near 0"
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-            return base.Status.CONVERGED, f"IPOPT ended as {returned}, {closed}"
+            return base.Status.CONVERGED, f"IPOPT found a minimum; {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT stopped after {self.max_iterations} iterations, {closed}"
+            limit = f"IPOPT stopped after {self.max_iterations} iterations; {closed}"
             return base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return base.Status.STALLED, f"IPOPT ended as {returned}, {closed}; start nearer, or use gauss_newton"
+        return base.Status.STALLED, f"IPOPT found no minimum ({returned}); {closed}; use gauss_newton"
 
     def _by_condensing(
         self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
@@ -202,7 +202,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
                 if now.defect < _CLOSED_DEFECT:
-                    return ended(base.Status.CONVERGED, f"the largest defect is {now.defect:.1e}")
+                    return ended(base.Status.CONVERGED, f"the largest jump at a node (defect) is {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
@@ -222,7 +222,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
                     return ended(base.Status.STALLED, f"{reason}; set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        limit = f"no convergence in {self.max_iterations} iterations (the largest defect is {now.defect:.1e})"
+        limit = f"no convergence in {self.max_iterations} iterations (largest jump at a node: {now.defect:.1e})"
         return ended(base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations")
 
 

@@ -128,24 +128,26 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     return None
 
 
-def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport]) -> list[FrameReport]:
-    """Return all frames. A frame is marked as dropped if its misfit or grasp gap is far from that of good frames."""
+def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], grasped: Sequence[str]) -> list[FrameReport]:
+    """Mark frames as dropped if misfit or gap at a point in `grasped` are far from good frames. Returns all frames."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)
-    usual = float(np.median([fit.mean_distance for fit in fits.values()]))
+    limit = _MAX_DISTANCE_OVER_MEDIAN * float(np.median([fit.mean_distance for fit in fits.values()]))
     gap = np.median([fit.grasp_gaps for fit in fits.values()], axis=0)
     made = list(frames)
     for k, fit in fits.items():
         reason = ""
-        apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
-        if fit.mean_distance > _MAX_DISTANCE_OVER_MEDIAN * usual:
-            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average. In a usual frame they are"
-            most = f"{1e3 * usual:.1f} mm from it (median), and {_MAX_DISTANCE_OVER_MEDIAN} times as much is allowed"
+        shifts = np.linalg.norm(fit.grasp_gaps - gap, axis=1)
+        apart = float(shifts.max(initial=0.0))
+        if fit.mean_distance > limit:
+            off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, but only {1e3 * limit:.1f} mm are"
+            most = f"allowed ({_MAX_DISTANCE_OVER_MEDIAN} times the median of all frames). A part may be hidden"
             reason = f"the shape fits worse than in other frames: {off} {most}"
         elif apart > _MAX_GRASP_GAP_CHANGE:
-            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed. The time stamp may be late"
-            reason = f"{_END_ELSEWHERE}: the gap differs by {1e3 * apart:.0f} mm from the usual one; {most}"
+            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed. The frame's time stamp may be late"
+            at = f"the distance of {grasped[int(np.argmax(shifts))]} from its gripper"
+            reason = f"{_END_ELSEWHERE}: {at} differs by {1e3 * apart:.0f} mm from that in most frames; {most}"
         made[k] = replace(frames[k], drop_reason=reason)
     return made
 
@@ -269,7 +271,7 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
     elif abs(above) > _HANGING_HEIGHT_FRACTION * between:
         other, said = above < 0, "is the higher end"
     else:
-        other, said = False, "may be at either end, one is chosen; track.options.approximate_root_position selects it"
+        other, said = False, "may be at either end, so one was chosen; set track.options.approximate_root_position"
     if other:
         made = [_exchanged(frame) for frame in made]
     return _fixed(made, options), f"the object's root {said}"
@@ -300,8 +302,9 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
-                off = f"it is {1e3 * away:.0f} mm away ({1e3 * most:.0f} mm are allowed)"
-                made[k] = replace(frames[k], drop_reason=f"the object's root is not where other frames have it: {off}")
+                off = f"{1e3 * away:.0f} mm away, {1e3 * most:.0f} mm are allowed (root_placement: free allows more)"
+                reason = f"the object's first end (root) is not where other frames have it: {off}"
+                made[k] = replace(frames[k], drop_reason=reason)
     return made
 
 

@@ -324,7 +324,8 @@ class SingleFrameTracker:
     def align_root_ends_and_mark_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Choose one root end for all frames, and mark outlying frames as dropped. Returns frames and a root note."""
         rooted, note = frame_selection.choose_root_end_of_frames(frames, self.options)
-        return frame_selection.mark_outlying_frames_as_dropped(rooted), note
+        grasped = [grasp.held_frame for grasp in self.system.grasps]
+        return frame_selection.mark_outlying_frames_as_dropped(rooted, grasped), note
 
     def track_result_from_frame_reports(
         self, frames: Sequence[FrameReport], note: str, common: SequenceEstimates

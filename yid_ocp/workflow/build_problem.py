@@ -280,7 +280,7 @@ def _once(
     others: list[Recording] = []
     for recording in estimate:
         if same := _duplicate(used, recording):
-            issues.append(replace(same[0], what=f"{same[0].what}, so it counts once"))
+            issues.append(replace(same[0], what=f"{same[0].what}, so these samples are used only once"))
         else:
             used.append(recording)
     for recording in held_out:

@@ -200,7 +200,8 @@ def _summary_lines(
             lines.append(f"sensors.{group}: `init` assigns recorded {names} to {to} ({reason})")
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        lines.append(f"`diagnose` does not try {', '.join(kinds)}, because no recording has the signal {signals}.")
+        why = f"because no recording has the signal {signals}. Nothing need be done"
+        lines.append(f"`diagnose` does not try {', '.join(kinds)}, {why}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm."

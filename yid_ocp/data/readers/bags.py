@@ -214,9 +214,11 @@ def _read_bag(
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
-        said = f"of {', '.join(sorted(turned))}, the orientations were left out"
-        more = (*more, f"{said}. To add points on their axes, 0.1 m away: --pose-axis-point-distance 0.1")
+        said = f"of {', '.join(sorted(turned))}, the orientations were not imported, only the positions. To keep them, "
+        said += "import again with --pose-axis-point-distance 0.1: it adds points 0.1 m away on the axes of each pose"
+        more = (*more, said)
     left = [f"{t.name} was left out ({t.n_messages} of {t.kind})" for t in bag.file.topics if t.name not in used]
+    left += ["if you need a topic that was left out, `yid-ocp import --preview` says how to import it"] * bool(left)
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
@@ -411,7 +413,9 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
         if (skipped := len(messages) - len(kept)) and names:
-            notes.append(f"{skipped} of {len(messages)} messages of {topic} were skipped, because joints are missing")
+            lacking = ", ".join(name for name in names if any(name not in m.content.name for m in messages))
+            said = f"{skipped} of {len(messages)} messages of {topic} were skipped, because they lack {lacking}"
+            notes.append(f"{said}; the recording has no samples at their times")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
             found.append(_States(topic, names, renamed, kept))

@@ -35,7 +35,7 @@ _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_inde
 _NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
 """Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
 _MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
-_PERCENT = "0 to 100 % of the gripper's calibrated range"
+_PERCENT = "recorded as 0 to 100 % of its calibrated range"
 
 
 class _Feature(BaseModel):
@@ -85,7 +85,7 @@ def _read_lerobot_episode(
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
     where = f"{dataset.folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
-        why = f"{_PERCENT} are no angles: state its angle in model.arms.locked_joints"
+        why = f"{_PERCENT}, not as an angle; state a fixed angle in model.arms.locked_joints"
         left |= dict.fromkeys(_grippers(names), why)
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
