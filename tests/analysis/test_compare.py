@@ -117,7 +117,7 @@ def test_command_weighs_all_noise_of_the_embedded_recordings(repository, carried
     """Torques with offsets mislead what takes them as true; the verdicts do not follow it."""
     config = repository / "configs" / "dual_arm_no_vision.yaml"
     done = carried_out("compare", config, settings=["compare.methods={single_shooting: {}}"])
-    assert done.out.startswith("Do not use values by single_shooting: they ignore noise")
+    assert done.out.startswith("Do not use the columns single_shooting, because these methods ignore noise")
     result = done.result
     assert result["judged"]["fit"]["explains"]
     assert not result["methods"]["single_shooting"]["fit"]["explains"]

@@ -159,7 +159,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     both = "a relative change of a and b in the ratio 1 : 1"
-    assert said.startswith(f"the recordings cannot distinguish {both} from another initial state; begin them at rest")
+    assert said.startswith(f"the recordings cannot distinguish {both} from another initial state; begin recordings")
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):

@@ -163,8 +163,8 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    at, rest = lines.index(said), "With half the time step, no estimate would change by more than its ± from the recordings (good)."
-    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
+    rest = "With half the time step, no estimate would change by more than its ± from the recordings (good)."
+    assert lines[(at := lines.index(said)) + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
     assert lines.index("it snaps") < at
     moved = {name: own | {"links": None} for name, own in moved.items()}
     assert not any("twice the links" in line for line in told("yid-solve/1", solved(discretisation=moved)))
@@ -189,7 +189,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
-    assert lines[0].startswith("Do not use values by single_shooting, late: they ignore noise of the inputs")
+    assert lines[0].startswith("Do not use the columns single_shooting and late, because these methods ignore noise")
     assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting (more than 2 std away)." in lines
     assert "The time limit ended late before the first iteration, so there are no values." in lines
     assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
