@@ -302,7 +302,7 @@ HELD = {
     "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
     "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
     "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 are exchanged"),
-    "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "and no change of unit, axes, names, frame, clock or joint zero"),
+    "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "no change of unit, axes, names, frame, clock"),
 }
 # millimetres, centimetres, inches, decimetres and feet, and read as such
 for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):

@@ -483,7 +483,7 @@ class AlternatingErrorGrowth:
             return f"{step} stable along {motion}"
         grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s, in total"
         total = f"to 10^{self.growth_decades:.2g} times its size (10^{_MAX_GROWTH_DECADES:g} is tolerated)"
-        remedy = f"set a shorter problem.time_step, such as {self.time_step / 2:g} s"
+        remedy = f"set problem.time_step: {self.time_step / 2:g} or less"
         return f"{step} too long for {motion}; {remedy}. The simulation is unstable: a numerical error {grows} {total}"
 
 

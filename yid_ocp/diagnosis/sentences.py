@@ -172,7 +172,8 @@ def _causes(result: DiagnosisResult) -> list[str]:
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = ". ".join(entry.disagreement_text for entry in result.failed_transfer_checks[:2])
-    either, none = f"Either {names} changed between recordings, or another cause acts", "No cause is named, because"
+    either = f"Either {names} changed between the recordings, so diagnose them separately, or another cause acts"
+    none = "No cause is named, because"
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": f"{none} none of the effects that were tried explains the error well enough.",

@@ -275,8 +275,7 @@ def _drain(
                     name = type(error).__name__
                     text = "every worker that tried it ended abruptly" if name == "KilledWorker" else f"{name}: {error}"
                 result = None if text else _arrived(job, look is not None)
-                text = text or "its worker left no result file, perhaps because it does not share this folder"
-                finished(job, result or TaskResult(job.task.name, error=text))
+                finished(job, result or TaskResult(job.task.name, error=text or "its worker left no result file"))
     except BaseException:
         for future in running:
             future.cancel()

@@ -83,7 +83,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     yield from copyable_estimates_blocks(result)
     yield result.get("safeguard", "")
-    ended = f"{result['status']}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
+    status = result["status"] + ", so do not use the values" * (result["status"] == "stalled")
+    ended = f"{status}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
@@ -247,7 +248,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"To find {', '.join(lost)}, start and grasps must be known." if lost else "", "verdict")
+    yield SummaryStatement(f"To find {', '.join(lost)}, start state and grasps must be known." if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")

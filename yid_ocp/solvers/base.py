@@ -437,7 +437,7 @@ class _MultiStartSearch:
             self._best.weighted, result.x, finish
         )
         if status == Status.CONVERGED and not ended:
-            stopped = f"no minimum, because a further step would lower the cost ({message}); do not use the values"
+            stopped = f"no minimum was reached, because a further step would lower the cost ({message})"
             return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use gauss_newton"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 

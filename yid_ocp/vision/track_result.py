@@ -143,7 +143,7 @@ def draw_frame_processing_stages(stages: SingleFrameStages, folder: str | os.Pat
     for number, picture in enumerate(pictures, start=1):
         written.append(path / f"{stem}_{number}_{picture.name}.png")
         frame = stages.raw_points if picture.name == "cloud" or not len(near) else near
-        ended = f"\nnot used: {report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
+        ended = f"\nnot used, because {report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
         _write(written[-1], f"{report.name}: {picture.title}{ended}", frame, stages.camera_position, picture)
     return written
 

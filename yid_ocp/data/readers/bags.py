@@ -414,8 +414,7 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
         if (skipped := len(messages) - len(kept)) and names:
             lacking = ", ".join(name for name in names if any(name not in m.content.name for m in messages))
-            said = f"{skipped} of {len(messages)} messages of {topic} were skipped, because they lack {lacking}"
-            notes.append(f"{said}; the recording has no samples at their times")
+            notes.append(f"{skipped} of {len(messages)} messages of {topic} gave no sample, as they lack {lacking}")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
             found.append(_States(topic, names, renamed, kept))
