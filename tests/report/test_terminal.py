@@ -163,10 +163,9 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    cure = "-5.5 (± 0.073). To cure this, set more links in model.object."
     rest = "With half the time step, no estimate would change by more than its ± from the recordings (good)."
     assert lines.index("it snaps") < (at := lines.index(said))
-    assert lines[at + 1 : at + 3] == [cure, rest]
+    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
     lines = told("yid-solve/1", solved(discretisation={name: own | {"links": None} for name, own in moved.items()}))
     assert not any("twice the links" in line for line in lines)
 

@@ -248,7 +248,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"To find {', '.join(lost)}, start state and grasps must be known." if lost else "", "verdict")
+    yield SummaryStatement(f"To find {', '.join(lost)}, start and grasps must be known." if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")
