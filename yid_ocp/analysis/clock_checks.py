@@ -153,7 +153,7 @@ def robot_held_point_clock_issues(
         error = f"{1e3 * abs(late):.3g} ± {1e3 * found.delay_std:.2g} ms {'late' if late > 0 else 'early'}"
         words = f"time stamps of {group.name} are {error} on the joints' clock ({1e3 * limit:.3g} ms is tolerated)"
         camera = "camera" in f"{group.name} {group.sensor_name}".lower() or group.camera_pose is not None
-        advice, setting = f"add {-late:+.3g} s to their times, or leave them out", f"sensors.{group.name}.use: false"
+        advice, setting = f"add {-late:+.3g} s to their times, or omit these points", f"sensors.{group.name}.use: false"
         if camera and late > 0:
             setting = known_effect_config_line("camera_latency", "camera", "delay", late)
             advice = f"add {-late:+.3g} s to their times, or model the delay"

@@ -290,7 +290,7 @@ def _plan(
         way = "lower plan.limits, or set another plan.start_joint_positions"
         message = f"the search could not improve the best of its random initial motions, which is the result; {way}"
     elif not chosen.is_converged:
-        message = f"the search ended after {chosen.n_iterations} rounds, before it converged; raise plan.max_iterations"
+        message = f"a better motion may exist: the search ended after {chosen.n_iterations} rounds (max_iterations)"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

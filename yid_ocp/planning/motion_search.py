@@ -246,7 +246,7 @@ class MotionToTargetSearch:
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
-            message = f"the search ended after {iterations} evaluations, before it converged; raise plan.max_iterations"
+            message = f"a better motion may exist: the search ended after {iterations} evaluations (max_iterations)"
         return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:

@@ -224,7 +224,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from hidden[:_MAX_DIRECTIONS]
-    yield "To find each, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)." if hidden else ""
+    yield "To find them, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if not result["profiles"]:
@@ -506,7 +506,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     spent = 1e3 * result["fit_seconds"]
     said = result["refused"] or f"{good} of {len(result['frames'])} frames are used. One fit took {spent:.0f} ms."
     yield SummaryStatement(said, "verdict")
-    yield from (f"{count_with_noun(n, 'frame')} left out: {reason}" for reason, n in result["dropped"].items())
+    yield from (f"{count_with_noun(n, 'frame')} left out, because {reason}" for reason, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 

@@ -106,7 +106,7 @@ def p_value_text(p_value: float) -> str:
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     issues = result.get("issues", ())
-    rows: TableRows = [("issue", "where", "certainty", "times the limit")]
+    rows: TableRows = [("issue", "where", "is it an error?", "times the limit")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in issues):
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]

@@ -396,7 +396,7 @@ class SingleFrameTracker:
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:
                     late = f"the frame's time stamp is {'late' if own.delay > 0 else 'early'}"
-                    raise dropped_frame_error(f"{late}: by {1e3 * abs(own.delay):.0f} ms")
+                    raise dropped_frame_error(f"{late}: it is {1e3 * abs(own.delay):.0f} ms off the camera's clock")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:

@@ -353,7 +353,7 @@ def _places(
             owner, colon, part = point.partition(":")
             frame, reason, std = "", "its place on the model is not known", 0.0
             if point in frames or (colon and owner in names and part.endswith("%")):
-                frame, reason = point, "found by name"
+                frame, reason = point, "their names are equal"
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
@@ -432,7 +432,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
             other = (holder, "a guess: the sensor carries this link and its load; if not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
-            _PointPlacement(name, name, "found by name") if moves else _PointPlacement(name, *other)
+            _PointPlacement(name, name, "their names are equal") if moves else _PointPlacement(name, *other)
             for name, moves in own.items()
         )
     return found
