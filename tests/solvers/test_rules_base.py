@@ -232,7 +232,7 @@ def test_weights_are_renewed_after_every_step_and_gains_kept_after_short_ones():
     assert solution.x.tolist() == pytest.approx([2.5])
     assert solution.problem.frozen_at == solution.x.tolist()
     assert solution.n_evaluations == 7
-    assert "sensors' noise alone" not in solution.message
+    assert "ignore noise of the torques" not in solution.message
 
 
 def overshooting(frozen):
@@ -392,7 +392,7 @@ def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     assert len(solver.runs) == 1
     assert problem.frozen == []
     assert solution.problem is problem
-    assert ("only the noise of sensors" in solution.message, solution.message[:7]) == (True, "run 1; ")
+    assert ("ignore noise of the torques" in solution.message, solution.message[:7]) == (True, "run 1; ")
 
 
 def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_in_place_of_a_prediction():
