@@ -164,13 +164,13 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     planned = read_recording(tmp_path / "out" / "recording.h5")
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     assert '<section id="plan">' in (tmp_path / "out" / "report.html").read_text()
-    words = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result)))
+    words = " ".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
     assert "It is the best of" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
-    assert "for the parameters of the configuration" in words
+    assert "holds for the configured initial values" in words
 
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
