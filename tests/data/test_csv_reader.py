@@ -151,6 +151,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "meaning of column 'force_x'", ""),
     "unit of what": (GOOD, {"units": {"angle": "deg"}}, "'angle', which is not the name of a quantity", ""),
     "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
+    "unit of a switch": (GOOD, {"units": {"torque_enable": "V"}}, "is not a unit of .torque_enable.", "leave"),
 }
 
 

@@ -221,7 +221,7 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
 
 def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     origin, grid = np.zeros((5, 3)), TimeGrid(0.0, 0.1, 4)
-    with pytest.raises(DataError, match="'o' and 'd' of a clamp coincide"):
+    with pytest.raises(DataError, match="'o' and 'd', which give a clamp's direction, coincide"):
         path_of(clamped(origin, origin), grid)
     hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
     hidden[1, 2] = math.nan

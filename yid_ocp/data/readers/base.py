@@ -97,12 +97,12 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
             what = f"a unit is given for '{quantity}', which is not the name of a quantity"
-            fitting = ", ".join(name for name, kind in _QUANTITIES.items() if unit in _TO_SI[kind]) or "none of them"
+            fitting = ", ".join(name for name, kind in _QUANTITIES.items() if unit in _TO_SI.get(kind, ())) or "none"
             said = unknown_name_error_arguments(quantity, _QUANTITIES, f"name the quantity: '{unit}' fits {fitting}")
             raise DataError(what, where=f"--units, for {where}", **said)
-        known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
+        known = {_spaceless(name): factor for name, factor in _TO_SI.get(_QUANTITIES[quantity], {}).items()}
         if _spaceless(unit) not in known:
-            what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
+            what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI.get(_QUANTITIES[quantity], ()))
             raise DataError(what, where=where, **unknown_name_error_arguments(unit, names))
         factors[quantity] = known[_spaceless(unit)]
     return factors
