@@ -116,7 +116,7 @@ def _gauss_newton_step_in_finer_model(
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
     if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
-        return "the finer model does not have the same samples and priors, so the two cannot be compared"
+        return "the finer model uses other samples of the recordings, so the two cannot be compared"
     is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian

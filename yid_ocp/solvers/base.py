@@ -438,7 +438,7 @@ class _MultiStartSearch:
         )
         if status == Status.CONVERGED and not ended:
             stopped = f"no minimum was reached, because a further step would lower the cost ({message})"
-            return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use gauss_newton"
+            return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use another solver"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 
 

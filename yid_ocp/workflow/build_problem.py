@@ -53,7 +53,6 @@ _EFFECTS_BY_CAUSE = {
 """Effects that model the error behind an issue, by the cause of the issue."""
 _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
 """Words in the names of parameters that are unobservable at rest."""
-_MAX_QUOTED_ISSUES = 3  # issues that an error quotes
 
 
 def make_problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
@@ -191,8 +190,8 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
-    if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
-        hint = f"first correct these issues: {'; '.join(f'{issue.location_text}: {issue.what}' for issue in issues)}"
+    if issues := _gravest_first(problem.options.data_issues):
+        hint = f"{hint}. The gravest issue of the recordings: {issues[0].location_text}: {issues[0].what}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_grasp_gaps_at_start(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
@@ -371,8 +370,8 @@ def _raise_for_issues(run: RunSettings, issues: Sequence[Issue]) -> None:
     if not grave:
         return
     first, *others = grave
-    more = [f"{issue.location_text}: {issue.what}" for issue in others]
-    what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
+    more = f"; also at {', '.join(issue.location_text for issue in others)}" if others else ""
+    what = f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}{more}"
     hint = first.advice + (f" ({first.setting})" if first.setting else "")
     raise DataError(what, where=first.location_text, allowed="the limits in docs/reference/data_checks.md", hint=hint)
 
