@@ -87,8 +87,8 @@ def check_not_too_many_numbers(count: int, where: str) -> None:
     """Raise `DataError` if an input file contains or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
-        what = f"the file holds {count / 1e6:.0f} million numbers, more than allowed"
-        raise DataError(what, where=where, allowed=allowed, hint="cut it into several shorter recordings")
+        hint = "cut it into several shorter recordings"
+        raise DataError("the file holds too many numbers", where=where, allowed=allowed, hint=hint)
 
 
 def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -196,7 +196,7 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
 def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
-    refused(path, "million numbers, more than allowed")
+    refused(path, "the file holds too many numbers")
     (path / FIRST).write_bytes(b"PAR1 and no more")
     refused(path, "table of the episode cannot be read")
     monkeypatch.setitem(sys.modules, "pyarrow", None)

@@ -572,7 +572,7 @@ def test_a_method_that_stops_short_has_not_converged_whatever_it_says():
     problem = MadeUp(linear([[1.0], [1.0]], [-3.0, -3.0]), (1.0,))
     stopped = fit_problem(problem, Steps([[2.0]]))
     assert stopped.status == Status.STALLED
-    assert "a further step would lower the cost (run 1)" in stopped.message
+    assert "stopped where the cost still falls (run 1)" in stopped.message
     assert fit_problem(problem, Steps([[3.0]])).status == Status.CONVERGED
     limited = fit_problem(problem, Steps([[2.0]], status=Status.ITERATION_LIMIT))
     assert (limited.status, limited.message) == (Status.ITERATION_LIMIT, "run 1")

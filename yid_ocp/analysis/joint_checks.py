@@ -431,7 +431,8 @@ def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright
     for who, by, joint in cases:
         words = f"{who} the opposite sign of what gravity and motion require: the fitted gain is {by * least:.3g} std"
         words += f" below zero ({least:g} std are tolerated)"
-        yield _issue("effort_sign", words, by, "reverse the sign: effort is the motor's torque on the joint", joint)
+        advice = "reverse the sign in the file: effort is the motor's torque on the joint"
+        yield _issue("effort_sign", words, by, advice, joint)
 
 
 def _offsets(data: _Data, fit: _EffortFit, told: BoolArray) -> Iterator[Issue]:

@@ -42,12 +42,12 @@ class EffectAmplitudeTransferCheck:
     def disagreement_text(self) -> str:
         """A text with both estimates, their difference and the limits that it exceeds if they are inconsistent."""
         (apart, spread), unit = self._difference_and_std, f" {self.unit}".removesuffix(" 1")
-        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
-        there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
+        here = f"{self.estimation_value:.4g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
+        there = f"{self.held_out_value:.4g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
         size = abs(self.estimation_value - self.neutral_value) / math.sqrt(2.0)
-        limits = f"2 standard deviations ({2 * spread:.2g}{unit}) and 70 % of the effect ({size:.2g}{unit})"
+        limits = f"2 standard deviations ({2 * spread:.2g}{unit}) and 70 % of the effect ({size:.3g}{unit})"
         text = f"{self.effect_label}.{self.parameter} is {here} and {there}"
-        return f"{text}, so the difference of {apart:.2g}{unit} exceeds {limits}"
+        return f"{text}, so the difference of {apart:.3g}{unit} exceeds {limits}"
 
     @property
     def _difference_and_std(self) -> tuple[float, float]:

@@ -155,8 +155,8 @@ class EquilibriumSolver:
             # with a torque, any of the three starts may lead to a wrong equilibrium
             parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
             limit = f"at most {_MAX_HOLD_DEFLECTION:g} rad is tolerated"
-            far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad ({limit})"
-            message = f"the measured {parts} at rest: {far}"
+            far = f"{system.driven[joint]} would come to rest {abs(give[joint]):.3g} rad away ({limit})"
+            message = f"the measured {parts}: {far}. Check its torque, the payload and the grasp"
         # torque and posture enter only as torque + holding stiffness * posture
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
         derivatives, said = (by_theta, by_posture, by_torque), (not failed, error, message)

@@ -326,7 +326,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
         yield "No parameter can be found from these recordings, so there is nothing to agree on."
         yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help."
     elif not result["agree"]:
-        yield "The methods do not agree on the parameters that are found. The reasons are below the tables."
+        yield "The methods do not agree: use the one with the lowest cost. The reasons are below the tables."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:

@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols, System
 from yid_ocp.options import OptionInfo
@@ -185,8 +185,9 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
     for name in names:
         if name not in joints.names:
             what = f"joint '{name}' of the model is not recorded"
-            said = unknown_name_error_arguments(name, joints.names, "record it, or leave it out of model.arms.joints")
-            raise DataError(what, where=f"recording '{where}': joints", **said)
+            others, allowed = [own for own in joints.names if own not in names], ", ".join(joints.names)
+            hint = nearest_name_question(name, others) or "record it, or leave it out of model.arms.joints"
+            raise DataError(what, where=f"recording '{where}': joints", allowed=allowed, hint=hint)
     return [joints.names.index(name) for name in names]
 
 

@@ -437,8 +437,8 @@ class _MultiStartSearch:
             self._best.weighted, result.x, finish
         )
         if status == Status.CONVERGED and not ended:
-            stopped = f"no minimum was reached, because a further step would lower the cost ({message})"
-            return Status.STALLED, f"{stopped}; start nearer, widen the bounds, or use another solver"
+            stopped = f"the search stopped where the cost still falls ({message}), so do not use the values"
+            return Status.STALLED, f"{stopped}; set a smaller tolerance, other initial values or another solver"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 
 
