@@ -321,7 +321,7 @@ def common(config: str, column: int, start: float) -> Iterator[Case]:
     yield Case("stuck encoder", config, stuck(column, start), ("stuck",))
     yield Case("gap of 2 s", config, kept(gap), ("gap",))
     wrists = scaled("position", 20.0, 4, 5, 6)
-    said = "times as fast as its recorded velocity"
+    said = "an angle has the wrong scale"
     yield Case("wrist angles x 20", config, wrists, ("angle_scale", "angle_limits"), refused=said)
     yield Case("degrees", config, scaled("position", 57.29578), ("degrees",), refused="degrees")
     yield Case("clock in ms", config, times(lambda t: 1e3 * t), ("time_unit", "time_scale"), refused="seconds")

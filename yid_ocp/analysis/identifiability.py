@@ -399,7 +399,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
         remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
         if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
             return words
-    return f"another initial state and position of the grasp; {rest}, or {grasp}"
+    return f"another initial state and position of the grasp; {rest}, or {grasp}" if places else f"others; {rest}"
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:

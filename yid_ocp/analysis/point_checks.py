@@ -310,7 +310,7 @@ def cable_point_geometry_issues(cable: CableVertices, recording: Recording, grav
         typical = float(np.median(_lengths(at, edges) / _lengths(rest, edges)))
         low, high = 1 - _LENGTH_RTOL, 1 + _LENGTH_RTOL
         found: list[Issue | None] = [_exchanged(at, rest, edges), _upside_down(cable, at, rest, gravity)]
-        if not low <= typical <= high:
+        if typical < low or typical > high:
             words = f"distances of neighbouring points are {typical:.3g} times those of the undeformed cable"
             words, depth = f"{words} ({low:g} to {high:g} times is tolerated)", max(typical / high, low / typical)
             found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")

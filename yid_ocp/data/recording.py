@@ -510,12 +510,13 @@ def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "a rigid transform")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
     last_is_unit = np.allclose(pose[3], np.eye(4)[3], rtol=0, atol=1e-6)
-    orthonormal = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6)
+    with np.errstate(all="ignore"):
+        orthonormal, det = np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-6), np.linalg.det(rotation)
     for good, what, hint in (
         (np.isfinite(pose).all(), "has a value that is not finite", "write finite numbers, or leave the pose out"),
         (last_is_unit, f"has the last row {pose[3].tolist()}", "transpose the pose, or write 0 0 0 1 as its last row"),
         (orthonormal, "has axes that are not orthonormal", "write the rotation with 7 digits and without a scale"),
-        (np.linalg.det(rotation) > 0, "contains a reflection", "reverse the signs of one column of the rotation"),
+        (det > 0, "contains a reflection", "reverse the signs of one column of the rotation"),
     ):
         raise_data_error_unless(good, f"the pose {what}", where, allowed, hint)
 

@@ -138,12 +138,15 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
 
+        systems = (like or self).system, self.system
+        links = [[segment.link_joints for segment in system.segment_layouts] for system in systems]
+
         def finish(episode: Episode) -> Episode:
-            own, system, same = known.get(episode.name), self.system, like and like.system
-            if not (same and own) or own.equilibrium_guess is None or same.segment_layouts != system.segment_layouts:
+            own, q0 = known.get(episode.name) if links[0] == links[1] else None, episode.initial_known_coordinates
+            if own is None or own.equilibrium_guess is None or not np.array_equal(own.initial_known_coordinates, q0):
                 return episode_with_equilibrium_guess(self.predictor, episode, theta)
-            guess = np.zeros(system.n_coordinates)  # joints of neutral effects are at rest
-            guess[[system.mechanism.joint_index(name) for name in same.mechanism.joint_names]] = own.equilibrium_guess
+            guess = np.zeros(self.system.n_coordinates)  # joints of neutral effects are at rest
+            guess[[*map(self.system.mechanism.joint_index, systems[0].mechanism.joint_names)]] = own.equilibrium_guess
             return replace(episode, equilibrium_guess=guess)
 
         ready, other = (tuple(map(finish, group)) for group in (fitted, others))

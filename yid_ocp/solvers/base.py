@@ -437,7 +437,7 @@ class _MultiStartSearch:
             self._best.weighted, result.x, finish
         )
         if status == Status.CONVERGED and not ended:
-            stopped = f"the search stopped where the cost still falls ({message}), so do not use the values"
+            stopped = f"the search stopped where the cost still falls ({message})"
             return Status.STALLED, f"{stopped}; set a smaller tolerance, other initial values or another solver"
         return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
 

@@ -210,7 +210,7 @@ def _none_good(
     cause = _because(sizes, most.startswith(_MISFIT_REASONS))
     hint = "check track.camera_pose, track.point_cloud_unit and track.options.filters"
     of_cause = {
-        "stamp is late": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",
+        "time stamp is": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "from end to end": _hint(sizes, things, "tighten track.options.filters, or loosen them if a part is missing"),
         "crosses or touches itself": "record the object without crossings and contacts of its parts",

@@ -190,8 +190,9 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
-    if issues := _gravest_first(problem.options.data_issues):
-        hint = f"{hint}. The gravest issue of the recordings: {issues[0].location_text}: {issues[0].what}"
+    if issues := _gravest_first(problem.options.data_issues)[:3]:
+        told = (f"{ISSUE_CAUSE_DESCRIPTIONS[issue.cause]} ({issue.location_text})" for issue in issues)
+        hint = f"{hint}. Issues found before: {'; '.join(told)}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_grasp_gaps_at_start(problem, episode).items():
             if gap > _MAX_GRASP_GAP:

@@ -97,8 +97,9 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     for quantity, unit in units.items():
         if quantity not in _QUANTITIES:
             what = f"a unit is given for '{quantity}', which is not the name of a quantity"
-            fitting = ", ".join(name for name, kind in _QUANTITIES.items() if unit in _TO_SI.get(kind, ())) or "none"
-            said = unknown_name_error_arguments(quantity, _QUANTITIES, f"name the quantity: '{unit}' fits {fitting}")
+            fitting = ", ".join(name for name, kind in _QUANTITIES.items() if unit in _TO_SI.get(kind, ()))
+            hint = f"name the quantity: '{unit}' fits {fitting}" if fitting else "write for example position=deg"
+            said = unknown_name_error_arguments(quantity, _QUANTITIES, hint)
             raise DataError(what, where=f"--units, for {where}", **said)
         known = {_spaceless(name): factor for name, factor in _TO_SI.get(_QUANTITIES[quantity], {}).items()}
         if _spaceless(unit) not in known:
