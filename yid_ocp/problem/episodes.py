@@ -258,8 +258,7 @@ def prepare_episode(
         if all(np.array_equal(*pair) for pair in pairs):
             arms = np.array(system.actuated_coordinate_indices, np.int32)
             index, loop = np.concatenate([arms, system.n_coordinates + arms]), like.tracking_feedback
-            loop = loop and replace(loop, state_indices=index[: len(loop.state_indices)])
-            return replace(episode, tracking_feedback=loop)
+            return replace(episode, tracking_feedback=loop and replace(loop, state_indices=index[: loop.gain.shape[2]]))
     return _tracked(episode, functions, options, theta)
 
 

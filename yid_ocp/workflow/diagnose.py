@@ -70,9 +70,8 @@ def run_diagnose(
 ) -> CommandOutcome[DiagnosisResult]:
     """Run a diagnosis and write the run folder. Finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
-        settings_yaml = folder.record_run_start(run, "diagnose", _flags(run))
-        made_from = folder.input_hashes, settings_yaml, software_and_plugin_versions()
-        refits = _SingleJsonFileRefitStore(folder, *made_from)
+        text = folder.record_run_start(run, "diagnose", _flags(run))
+        refits = _SingleJsonFileRefitStore(folder, folder.input_hashes, text, software_and_plugin_versions())
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=24.5)
         runs = run_history.estimates_of_each_baseline_run(run)
