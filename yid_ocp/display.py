@@ -52,9 +52,9 @@ def count_with_noun(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def p_value_relation_text(p_value: float) -> str:
-    """Format a p-value after the letter p, such as `= 0.02`. Values below 1e-12 give `< 1e-12`."""
-    return f"= {p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
+def p_value_text(p_value: float, relation: str = "") -> str:
+    """Format a p-value after a `relation`, such as "= ". Values below 1e-12 give `< 1e-12`."""
+    return f"{relation}{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
 def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES_IN_LINE) -> str:

@@ -182,6 +182,11 @@ BROKEN = {
 }
 
 
+def test_a_joint_is_chosen_once(urdf_folder):
+    with pytest.raises(ModelError, match="joint 'spin' is listed twice"):
+        read_urdf(urdf_folder / "mixed_joints.urdf", joints=["spin", "swing", "spin"])
+
+
 @pytest.mark.parametrize("name", list(BROKEN))
 def test_a_broken_urdf_is_refused(refused_with, name, tmp_path):
     parts, words = BROKEN[name]

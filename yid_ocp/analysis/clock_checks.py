@@ -326,7 +326,9 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     for group, parts in by_group.items():
         *squares, count = (sum(column) for column in zip(*parts, strict=True))
         free = count - len(problem.initial_unknowns)
-        seen = math.sqrt(max(squares) / free) if free >= 0.5 * count else math.inf
+        if free < 0.5 * count:
+            continue
+        seen = math.sqrt(max(squares) / free)
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)

@@ -150,7 +150,7 @@ def identifiability(
         as_solved, wide = wide is problem, problem_with_whitening_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
-            raise failed_rollout_error(evaluation.message, "the initial values" if solution is None else "solution")
+            raise failed_rollout_error(evaluation.message, "the initial values" if solution is None else "the solution")
         covariance, chi2 = uncertainty.unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None
         if solution is None:

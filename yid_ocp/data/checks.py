@@ -185,11 +185,10 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             late, lag = "late" if lag[0] == "-" else "early", lag.partition(":")[0]
             what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the object swings behind the arm"
-            advice = (
-                f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. If they "
-            )
-            advice += f"are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, or let a "
-            advice, line = f"{advice}fit estimate it", f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
+            advice = f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. "
+            advice += f"If they are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, "
+            advice += "or let a fit estimate it"
+            line = f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=line)
 
 

@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text, p_value_relation_text
+from yid_ocp.display import abbreviated_names_text, p_value_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
@@ -108,7 +108,7 @@ def _gap(result: DiagnosisResult) -> str:
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    p_text, detectable = p_value_relation_text(p_value), f"would show {sum(seen)} of {len(seen)} effects"
+    p_text, detectable = p_value_text(p_value, "= "), f"would show {sum(seen)} of {len(seen)} effects"
     if result.verdict == "insufficient_data":
         dof, few = f"{tests[0].degrees_of_freedom:.0f}", f"more than {unknowns}, the number of unknowns, are needed"
         said = f"they have {dof} independent samples ({few}), and {detectable} (at least 1 is needed)"
@@ -120,7 +120,7 @@ def _gap(result: DiagnosisResult) -> str:
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
         return f"The nominal model has an error beyond noise (a gap){only}: {sizes} (p {p_text})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"But the error has the pattern of {best.effect.label} (p {p_value_relation_text(p_value)})"
+    small = f"But the error has the pattern of {best.effect.label} (p {p_value_text(p_value, '= ')})"
     return f"In total the error of the nominal model is within noise: {sizes}. {small}."
 
 
@@ -132,7 +132,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
     small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
-    seen = f"The error has the pattern of {''.join(best)} (p {p_value_relation_text(along)} if there is only noise)"
+    seen = f"The error has the pattern of {''.join(best)} (p {p_value_text(along, '= ')} if there is only noise)"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]

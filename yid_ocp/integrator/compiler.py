@@ -201,8 +201,8 @@ def _library_file(source: str, level: str, make: Callable[[], str | None] | None
         message = "Compiled code cannot be stored in %s (%s), so computations run uncompiled (slower). %s"
         _LOG.warning(message, folder, error.strerror or error, "Set YID_OCP_CACHE to another folder, or CC=none.")
         return None
-    message = "The C compiler %s failed, so computations run uncompiled (slower). Repair it, or set CC to another. %s"
-    _LOG.warning(message, path, f"It printed:\n{said[:2000]}")
+    message = "The C compiler %s failed, so computations run uncompiled (slower). Repair it, or set CC to another. "
+    _LOG.warning(message + "It printed:\n%s", path, said[:2000])
     return None
 
 

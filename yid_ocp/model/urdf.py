@@ -120,7 +120,7 @@ def read_urdf(
 
     Each movable joint has the parameter `JOINT.mass` [kg], which also scales the inertia of its bodies. Links without a
     movable joint before them are fixed to the world. Every link is a frame of the same name. Raises `ModelError` for a
-    missing or malformed file, MJCF without `mujoco`, an unknown joint, or one that neither turns nor slides.
+    missing or malformed file, MJCF without `mujoco`, an unknown or repeated joint, or one that does not move.
 
     Parameters
     ----------
@@ -141,8 +141,13 @@ def read_urdf(
             hint = f"did you mean package:{path}?"
         allowed = "the path of a file; package:NAME (of example-robot-data); default:NAME.urdf (of yid_ocp)"
         raise ModelError(f"there is no URDF file '{file}'", where=str(path), allowed=allowed, hint=hint)
-    robot, where, named = _parsed(file), str(file), (*(joints or ()), *locked)
+    robot, where, chosen = _parsed(file), str(file), list(joints or ())
+    named = (*chosen, *locked)
     root = _check_tree(robot, where, named)
+    if len(set(chosen)) < len(chosen):
+        twice = max(chosen, key=chosen.count)
+        what, hint = f"joint '{twice}' is listed twice", f"delete one '{twice}'"
+        raise ModelError(what, where=where, allowed="each joint once", hint=hint)
     dropped = _with_all_below(exclude_links, robot, where)
     for joint in robot.joints:
         if joint.child in dropped and joint.name in named:

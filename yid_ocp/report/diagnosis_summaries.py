@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, p_value_relation_text
+from yid_ocp.display import abbreviated_names_text, p_value_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -22,7 +22,6 @@ from yid_ocp.report.terminal import (
     copyable_estimates_blocks,
     issue_summary_blocks,
     misfit_summary_blocks,
-    p_value_text,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
@@ -381,7 +380,7 @@ def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list
 
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
-    p = p_value_relation_text(result["p_value"])
+    p = p_value_text(result["p_value"], "= ")
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
@@ -390,7 +389,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        yield f"{name} is not the same in all runs: {ends} (p {p_value_relation_text(entry['p_value'])})."
+        yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')})."
     if wrong:
         yield f"Do not trust {' and '.join(wrong)}, because without it the other runs agree much better."
     elif drifted:

@@ -98,11 +98,6 @@ def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, st
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
 
-def p_value_text(p_value: float) -> str:
-    """Format a p-value. Values below 1e-12 give `< 1e-12`."""
-    return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
-
-
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     issues = result.get("issues", ())

@@ -72,9 +72,6 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     item = model.object
     with add_setting_location_to_errors(run, "model", "object"):
         objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
-    if repeated := sorted({name for name in arms.joints or () if list(arms.joints or ()).count(name) > 1}):
-        what, hint = f"joint '{repeated[0]}' is listed twice", f"delete one '{repeated[0]}'"
-        raise run.config_error(what, "model", "arms", "joints", allowed="each joint once", hint=hint)
     mode = "driven" if are_arm_states_estimated(run) else arms.mode
     check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
