@@ -87,7 +87,7 @@ SHORT = np.arange(0, 2, 1 / RATE)
 
 def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
-    assert "`init` assigns recorded m1 to cable:50%" in capsys.readouterr().out
+    assert "`init` assigns recorded m1 to the frame cable:50% of the model, because it is at most 50" in capsys.readouterr().out
     run = load_config("run.yaml")
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
@@ -213,8 +213,8 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "[{kind: effort_offset, location: JOINT}] and parameters" in text
-    assert "#   {effort_sampling_kind: sample}: the recordings do not say" in text
+    assert "add {kind: effort_offset, location: JOINT} to\n" in text
+    assert "#   efforts are taken as samples, since the recordings do not state it" in text
     Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))
     assert "joint_coulomb@roll.tau_c" in build_system(load_config("friction.yaml")).parameters
     # damping of the URDF is proposed, friction only said
@@ -227,7 +227,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
     assert "damping: {pitch: 0.4} N m s/rad, as the robot file states" in (told := capsys.readouterr().out)
-    assert told.count("effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm") == 2
+    assert told.count("find friction and payload of the arm too, set sensors.joints.effort.use: true") == 2
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:
@@ -479,7 +479,7 @@ def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.Captur
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert "is its frame right?" in capsys.readouterr().out
+    assert "Check the frame of the recorded positions" in capsys.readouterr().out
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2

@@ -43,7 +43,7 @@ _MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther fro
 _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the holder must stand still [s]
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
 _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
-_SEEN_NOISE, _STATED_NOISE = "estimated from differences of consecutive samples", "stated in the recording"
+_SEEN_NOISE, _STATED_NOISE = "estimated from differences of consecutive samples", "as the recording states"
 _LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
 """Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
 
@@ -277,10 +277,10 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if not has_object:
         return "prescribed", "the arm moves as measured, and the model predicts the efforts that this motion requires"
     if closed:
-        return "driven", "grasps form closed chains, in which errors of measured angles would cause false forces"
+        return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
-        return "prescribed", f"the object hangs on the arm and {seen} see the object, so the arm moves as measured"
-    return "prescribed", "no sensor measures the object, so its parameters are estimated from the arm's efforts"
+        return "prescribed", f"the arm moves as measured, because it carries the object and {seen} show how the object moves"
+    return "prescribed", "the arm moves as measured; its efforts show the object, because no other sensor does"
 
 
 def _commanded(joints: JointGroup) -> bool:
@@ -405,18 +405,18 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} times the object's length away from {holder}: is its frame right?"
+            return "", f"it is {part:.1f} times the object's length away from {holder}. Check the frame of the recorded positions"
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
-        beyond = " (beyond the end: are length, frame and clocks right?)" if part > 1.05 else ""
-        return _along(branch.name, min(100, percent)), f"at most {part:.1%} of the length away from {holder}{beyond}"
+        beyond = " (beyond the end: check length, frame and clocks)" if part > 1.05 else ""
+        return _along(branch.name, min(100, percent)), f"it is at most {part:.1%} of the length away from {holder}{beyond}"
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
     if apart[name] > 0.5 * max(branch.length for branch in branches):
-        return "", f"it is {apart[name]:.2g} m away from the straight object: is its frame right?"
-    return name, f"{1e3 * apart[name]:.0f} mm from this frame when the object is straight"
+        return "", f"it is {apart[name]:.2g} m away from the straight object. Check the frame of the recorded positions"
+    return name, f"it is {1e3 * apart[name]:.0f} mm from this frame when the object is straight"
 
 
 def _along(name: str, percent: float) -> str:
@@ -427,9 +427,9 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     """Frames of wrist sensors and inertial units: the frame of the same name, else, for a wrist, the holder."""
     found: dict[str, tuple[_PointPlacement, ...]] = {}
     for key, group, channel in _mounted_channels(recording):
-        other = ("", "no link has this name: for use: true, set frame_by_recorded_name: {NAME: FRAME}")
+        other = ("", "no link has this name. To use it, set {frame_by_recorded_name: {NAME: FRAME}, use: true}")
         if channel.group == "wrist":
-            other = (holder, "a guess: the sensor carries this link and its load; if not, set frame_by_recorded_name")
+            other = (holder, "a wrist sensor usually carries this link and its load. If not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
             _PointPlacement(name, name, "their names are equal") if moves else _PointPlacement(name, *other)
@@ -501,7 +501,7 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
         sizes += [noise_or_quantization_std(group.t[seen], column) for column in group.position[seen, i].T]
     if slow or not any(sizes):
         std = _CAMERA_STD if slow else _MARKER_STD
-        return _GroupNoise(std, "m", "a guess: the data are too slow or too clean to show the noise")
+        return _GroupNoise(std, "m", "a guess, because the data are too slow or too clean to show the noise")
     return _GroupNoise(math.sqrt(math.fsum(x * x for x in sizes) / np.count_nonzero(sizes)), "m", _SEEN_NOISE)
 
 
@@ -519,9 +519,9 @@ def _clock(group: JointGroup | PointGroup) -> str:
     if not len(steps):
         return "one sample"
     uneven = float(np.std(steps) / np.mean(steps))
-    said = f"{mean_sample_rate(group.t):.4g} Hz, a {group.clock} clock"
+    said = f"{mean_sample_rate(group.t):.4g} Hz, with {group.clock} times"
     if uneven >= 0.01:
-        said += f", uneven by {uneven:.0%}"
+        said += f", whose periods vary by {uneven:.0%}"
     if isinstance(group, PointGroup) and group.clock_offset_std is not None:
         said += f", known to ± {group.clock_offset_std:g} s (clock_offset_std), which a fit corrects"
     return said

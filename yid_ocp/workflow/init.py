@@ -10,6 +10,7 @@ import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -186,25 +187,24 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
+    carried = "object held by" if proposal.has_object else "no object; a payload is assumed at the frame"
     lines = [
-        f"joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"object held by: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),
+        f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
+        f"{carried}: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),
         f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
         f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
     ]
     damping = _value(proposal.urdf_joint_damping)
-    lines += [f"damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
+    lines += [f"model.damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
-        for names, frame, reason in _merged_places(places):
-            to = "no frame of the model" if frame == "?" else frame
-            lines.append(f"sensors.{group}: `init` assigns recorded {names} to {to} ({reason})")
+        lines += [f"sensors.{group}: {sentence}" for sentence in _place_sentences(places)]
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
-    for signals, kinds in effect_kinds_by_missing_signals(recordings).items():
-        why = f"because no recording has the signal {signals}. Nothing need be done"
-        lines.append(f"`diagnose` does not try {', '.join(kinds)}, {why}.")
+    if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
+        lines.append(f"These recordings cannot show some effects ({', '.join(kinds)}). `diagnose` leaves them out.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
-    unseen = "Set sensors.joints.effort.use: true if diagnose is to find joint_*, payload and effort_* of the arm."
+    unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "
+    unseen += "`diagnose` find friction and payload of the arm too, set sensors.joints.effort.use: true."
     lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
@@ -212,13 +212,14 @@ def _summary_lines(
     return [*lines, ""]
 
 
-def _merged_places(places: Iterable[Any]) -> list[tuple[str, str, str]]:
-    """Return points, frame (`?` if unknown) and reason. Points with the same frame and reason are one entry."""
-    points: dict[tuple[str, str], list[str]] = {}
+def _place_sentences(places: Iterable[Any]) -> list[str]:
+    """Return a sentence on the frame of points, or of sensors. Those with the same frame and reason share it."""
+    points: dict[str, list[str]] = {}
     for own in places:
-        frame = "the frame of the same name" if own.frame == own.point else own.frame or "?"
-        points.setdefault((frame, own.reason), []).append(own.point)
-    return [(abbreviated_names_text(names, math.inf), *about) for about, names in points.items()]
+        frame = f"the frame {own.frame} of the model" if own.frame else "no frame and does not use it"
+        words = "the frame of the same name" if own.frame == own.point else f"{frame}, because {own.reason}"
+        points.setdefault(words, []).append(own.point)
+    return [f"`init` assigns recorded {abbreviated_names_text(n, math.inf)} to {w}" for w, n in points.items()]
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:
@@ -264,7 +265,7 @@ def _config_text(
     loader = jinja2.PackageLoader("yid_ocp.workflow")
     environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters |= {"yaml": _value, "wrapped": _wrapped_list, "number": _number}
-    environment.filters["merged"] = _merged_places
+    environment.filters["sentences"] = _place_sentences
     environment.filters["settings"] = lambda settings: "\n".join(_settings_lines("    ", settings))
     known: dict[str, Any] = {"about": about, "robot": robot, "item": item, "files": recordings, "imports": imports}
     known |= {"p": proposal, "sensors": _sensors(proposal), "motors": list(MOTOR_PRESETS)}
@@ -337,9 +338,9 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], str, Sequence[Any]]]:
     """Yield every sensor group with its settings as YAML, their reason, and the places of its points."""
     for group, noise in proposal.noise_by_group.items():
-        places, entries, said = proposal.point_placements.get(group, ()), [], f"noise: {noise.reason}"
+        places, entries, said = proposal.point_placements.get(group, ()), [], f"noise {noise.reason}"
         if noise.std is not None:
-            entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
+            entries, said = [f"std: {_number(noise.std)}"], f"noise of {noise.std:.2g} {noise.unit}, {noise.reason}"
         elsewhere = (place for place in places if place.model_frame not in ("", place.point))
         if frames := {place.point: place.frame for place in elsewhere}:
             entries.append(f"frame_by_recorded_name: {_value(frames)}")
@@ -349,21 +350,20 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
                 biases = {joint: float(f"{std:.2g}") for joint, std in proposal.torque_bias_std.items()}
                 values = _number(next(iter(biases.values()))) if len(set(biases.values())) == 1 else _value(biases)
                 entries.append(f"bias_std: {values}")
-                said += "; bias_std (constant error): a guess, 1 % of the effort limit"
+                said += ". bias_std is the expected constant error of a torque (a guess, 1 % of its limit)"
             if told_by_points:
                 entries = ["use: false", *entries]
-                said = "use: true looks for friction and payload of the arm; bias_std allows a constant error of each "
-                said += "torque (a guess: 1 % of its limit). To estimate it: bias_std: 0, model.effects "
-                said += "[{kind: effort_offset, location: JOINT}] and parameters {effort_offset@*: {free: true}}"
+                said = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
             entries = ["use: false", *entries]
-            said = "places of its points are unknown; to use it, set frame_by_recorded_name: {POINT: FRAME}"
+            said = "not used, because the frames of its points are unknown. To use it, set "
+            said += "{frame_by_recorded_name: {POINT: FRAME}, use: true}"
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
-            why = "not usable while noisy torques move the arms; to use it, set mode: prescribed"
+            why = "torques with noise move the arm. To use it, set model.arms.mode: prescribed and use: true here"
             entries = ["use: false", *entries]
-            said = why if proposal.arm_mode == "driven" else "its frame is not known"
+            said = f"not used, because {why if proposal.arm_mode == 'driven' else 'its frame is unknown, see below'}"
         elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
             entries = ["use: false", *entries]
-            said = "the driver's estimate from joint torques, without known loads: use it only in place of efforts"
+            said = "not used: the robot's driver computes it from joint torques. Use it only in place of efforts"
         yield group, entries, said, places
