@@ -272,7 +272,7 @@ def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
     assert by_name["/left"].imported_as == "joints a"
     assert by_name["/left"].mean_rate == pytest.approx(100.0)
     assert by_name["/vrpn/hand/pose"].imported_as == "point hand"
-    assert "middle. To use one: --points /tf:FRAME" in by_name["/tf"].note
+    assert "middle. To use one, add --points /tf:FRAME" in by_name["/tf"].note
     assert sum(not source.imported_as for source in contents.sources) == 8
     assert contents.reader_options["point_names"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
     assert read_any(path, **contents.reader_options).joint_names == ("a", "b")

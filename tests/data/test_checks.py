@@ -250,7 +250,7 @@ def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is()
 def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
     with pytest.raises(ValueError, match="no cause 'bad'"):
         Issue("bad", "", "warning", 1.0, "", "r")
-    words = [Issue("gap", "", "warning", evidence, "", "r").certainty_word for evidence in (0.5, 1.6, 4.0)]
+    words = [Issue("noise", "", "warning", evidence, "", "r").certainty_word for evidence in (0.5, 1.6, 4.0)]
     words.append(Issue("few_samples", "", "warning", 1.3, "", "r").certainty_word)
     assert words == ["perhaps", "likely", "certain", "certain"]
     assert Issue("gap", "", "warning", np.inf, "", "r", "joints", "t", 1.0, 2.0).location_text == "r/joints/t, 1 to 2 s"

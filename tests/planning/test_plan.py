@@ -147,7 +147,7 @@ def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, foun
 def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
     hasty = plan_motion_to_target(moved, replace(wanted, duration=0.15))
     assert not hasty.is_successful
-    assert "shoulder exceeds its limit" in hasty.message or "leaves the point" in hasty.message
+    assert "of shoulder reaches" in hasty.message or "leaves the point" in hasty.message
     assert "plan.duration" in hasty.message
 
 

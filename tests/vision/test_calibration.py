@@ -161,7 +161,7 @@ def test_pose_depth_and_clock_are_found(robot, clean, wrong):
     assert std_of(found) < 0.01
     assert abs(found.camera_state.clock_offset - true.clock_offset) < 4 * std_of(found)
     assert found.arm_visibility.there > 0.9
-    assert ("the camera at its specified pose sees" in found.message) == bool("turn" in wrong or "scale" in wrong)
+    assert ("With its specified pose, the camera sees" in found.message) == bool("turn" in wrong or "scale" in wrong)
 
 
 def test_standard_deviations_are_honest(robot):

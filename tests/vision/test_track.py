@@ -88,7 +88,7 @@ def test_a_displaced_camera_is_put_right(system, recording, clean):
     assert np.nanmean((errors / found.std) ** 2) < 1.5
     assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
     assert np.allclose(found.to_point_group().camera_pose, sequence.camera_pose, atol=0.02)
-    assert "one error of all frames" in found.to_point_group().sensor_name
+    assert "all frames share an error of" in found.to_point_group().sensor_name
 
 
 def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):

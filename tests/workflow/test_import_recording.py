@@ -175,8 +175,8 @@ def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
     assert "m1..3, m5, tip" in printed("import", "run.csv", "--out", "run.h5")
     told = printed("init", "package:xarm7", "run.h5", "--out", "run.yaml")
     assert "joints: joint1..7\n" in told
-    for text, said in ((told, "m1..3, m5, tip to no frame"), ((odd / "run.yaml").read_text(), "m1..3, m5, tip at ?")):
-        assert said in text
+    for text in (told, (odd / "run.yaml").read_text()):
+        assert "m1..3, m5, tip to no frame" in text
 
 
 def test_no_command_is_suggested_that_would_fail(odd, printed):

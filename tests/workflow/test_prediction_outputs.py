@@ -232,7 +232,7 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     assert result["fit"]["data_trusted"] is believed
     assert [doubt["cause"] for doubt in result["issues"]] == ([] if believed else ["worse_than_guess"])
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
-    assert ("a prediction without a model has a smaller error" in done.out) is not believed
+    assert ("a guess without a model has a smaller error" in done.out) is not believed
 
 
 def test_a_group_without_a_sample_has_no_expected_error():
@@ -281,7 +281,7 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     assert "without the error of the time step" in next(copyable_estimates_blocks({"to_use": rough}))
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
-    assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; n links: times n/4 -->']
+    assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; for n links, multiply by n/4 -->']
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
     assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", [])
     small = copied(system, {}, (), **{"T1.bend": (2.2e-5, 5e-7, "1", "identifiable")})

@@ -61,7 +61,7 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out
         assert words in done.out
     page = (done.folder / "report.html").read_text()
     assert "<h3>Issues of the recordings</h3>" in page
-    assert "more noise than stated" in page
+    assert "a channel has more noise than stated" in page
 
 
 def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
@@ -81,14 +81,14 @@ def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
 def test_strict_stops_a_run_in_doubt(printed, damaged, tmp_path, left_nothing, command):
     file = damaged(noisy)
     told = printed(command, file, "--strict", "--out", tmp_path / "run", code=2)
-    assert "error: more noise than stated: the noise of effort.shoulder" in told
+    assert "error: a channel has more noise than stated: the noise of effort.shoulder" in told
     assert "damaged/joints/effort.shoulder" in told
     left_nothing(file)
 
 
 def test_check_lists_what_is_in_doubt(carried_out, damaged):
     done = carried_out("check", damaged(noisy))
-    assert "more noise than stated" in done.out
+    assert "a channel has more noise than stated" in done.out
     assert "A run is possible" in done.out.splitlines()[-2]
 
 

@@ -165,7 +165,7 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
     words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end "
-    words += f"(a change by {1e3 * limit:.3g} ms is tolerated): their clock runs {size} parts per thousand too {how}"
+    words += f"(a change by {1e3 * limit:.3g} ms is tolerated). Their clock runs {size} parts per thousand too {how}"
     advice = f"{timestamp_correction_advice(late, drift, 0.5 * sum(found.span))}, or leave the points out"
     setting = f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
@@ -173,7 +173,7 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
     """Return the formula that corrects time stamps which are `late` [s] at the time `middle` [s] and have a `drift`."""
-    return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
+    return f"replace the times t of the points by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
 def point_clock_offset_drift_and_rms_error(
@@ -244,12 +244,12 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
                     recordings[i] = replace(recordings[i], points=tuple(groups))
         made = recordings[:count], problem.free, problem.options, None, recordings[count:]
         problem = EstimationProblem(problem.step, *made)
-    issues, advice = list[Issue](), "values may be used, as the fit shifts the times; if you know the offset, import "
+    issues, advice = list[Issue](), "values may be used, as the fit shifts the times. If you know the offset, import "
     advice += "again with --clock-offset FILE=SECONDS"
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
-        words = f"a fit finds time stamps of {name} {said} and corrects them, but only ± {1e3 * std:.3g} ms is stated "
-        words += f"({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
+        words = f"a fit finds time stamps of {name} {said} and corrects them. Their clock_offset_std is only "
+        words += f"{1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
         if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues
@@ -337,7 +337,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         leaves = f"the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit} after the fit"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
-        advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"
+        advice = "the large std makes every ± too wide and hides small gaps. State the std of the actual noise"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         where = group.partition(".")[0]
         yield Issue("noise_overstated", f"{leaves}, {times}", "warning", severity, advice, "", where, setting=setting)

@@ -185,8 +185,8 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     inside = np.all((degrees > low - margin) & (degrees < high + margin))
     if np.any(beyond > margin) and inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
         words = f"angles reach {np.max(np.abs(position)):.3g} rad, {np.max(beyond):.3g} rad beyond their joint's limit "
-        words += f"({margin:g} rad is tolerated); if they are degrees, all are within the joint limits"
-        advice = "convert angles to radians, or for a CSV with degrees set import.units: {position: deg}"
+        words += f"({margin:g} rad is tolerated). If they are degrees, all are within the joint limits"
+        advice = "convert angles to radians, or import them again with --units position=deg"
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
     for j in np.flatnonzero(beyond > margin):
@@ -247,10 +247,10 @@ def slow_motion_excitation_issues(
     seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / noise))
-        asked = f"even at {arm.joint_names[j]}, the best joint, speed and acceleration require only {size[j]:.2g} N m"
-        words = f"{asked} (rms), but the noise of the efforts is {noise[j]:.2g} N m. Over all samples and joints, the "
-        words += f"signal has {seen:.2g} standard deviations of noise (at least {_MIN_SIGNAL_STDS:g} are needed)"
-        advice = "move faster: slow motions determine weight and stiffness, not damping, friction or inertia"
+        words = f"speed and acceleration require only {size[j]:.2g} N m (rms) at {arm.joint_names[j]}, the best "
+        words += f"joint, but the noise of its effort is {noise[j]:.2g} N m. Over all samples and joints, this signal "
+        words += f"is {seen:.2g} standard deviations of the noise (at least {_MIN_SIGNAL_STDS:g} are needed)"
+        advice = "move faster, because slow motions do not determine damping, friction and inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
 
@@ -366,7 +366,7 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
             which = "all joints" if dead.all() else which
             words = f"the effort of {which} is zero throughout, but gravity and motion require {asked:.2g} N m (rms)"
             advice = "record efforts, or move the arms as measured and use no efforts"
-            setting = "model.arms.mode: prescribed, sensors.joints.effort.use: false"
+            setting = "model.arms.mode: prescribed; sensors.joints.effort.use: false"
             found.append(_issue("effort_zero", words, 1e3, advice, setting=setting))
         else:
             # a delayed oscillation looks like a flipped sign, so delays are tested first
@@ -394,10 +394,9 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
         if not 1 / factor < scale < factor:
-            words = (
-                f"efforts are about {scale:.2g} times the required ones (1/{factor:g} to {factor:g} times is tolerated)"
-            )
-            advice = f"divide efforts by {1 / common:g}, if they are in another unit than N m"
+            words = f"efforts are {scale:.2g} times what gravity and motion require "
+            words += f"(1/{factor:g} to {factor:g} times is tolerated)"
+            advice = f"divide the efforts in the file by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
             common = 1.0  # said; each joint is compared with the others
     turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
@@ -416,7 +415,7 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
         strange = f"efforts of {lost.sum()} of {len(names)} joints ({', '.join(np.array(names)[lost])})"
-        words = f"{strange} do not match this robot and motion: their error is {left:.2g} times the usual model error "
+        words = f"{strange} do not match this robot and motion. Their error is {left:.2g} times the usual model error "
         words += f"({_WRONG_ROBOT_RMS:g} times is tolerated)"
         advice = "check that the recording is of this robot, and check its unit of time and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
@@ -429,9 +428,9 @@ def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
-        words = f"{who} the opposite sign of what gravity and motion require: the fitted gain is {by * least:.3g} std"
-        words += f" below zero ({least:g} std are tolerated)"
-        advice = "reverse the sign in the file: effort is the motor's torque on the joint"
+        words = f"{who} the opposite sign of what gravity and motion require. The fitted gain (recorded over required "
+        words += f"effort) is {by * least:.3g} standard deviations below zero ({least:g} are tolerated)"
+        advice = "multiply the effort in the file by -1, because effort is the motor's torque on the joint"
         yield _issue("effort_sign", words, by, advice, joint)
 
 
@@ -468,8 +467,8 @@ def _late(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     # by a factor of two, because friction and grasp explain part of a lag
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
         when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
-        words = f"efforts fit the motion best if their times are {abs(lag):.2g} s {when} "
-        words += f"(less than {_LAG_SEARCH_STEP:g} s is tolerated)"
+        words = f"efforts fit the motion best if their times are shifted {abs(lag):.2g} s {when} "
+        words += f"(a shift below {_LAG_SEARCH_STEP:g} s is tolerated)"
         lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         advice = "correct the times of efforts" + ", or model the delay" * bool(setting)

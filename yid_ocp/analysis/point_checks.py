@@ -125,7 +125,7 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     """Yield corrections: another unit of length, or axes exchanged or flipped about the world's origin."""
     for scale in _UNIT_SCALES:
         words = f"if positions are divided by {scale:g}"
-        yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
+        yield _Change("point_scale", words, f"divide positions in the file by {scale:g}", _rms(seen / scale - place))
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
     # the last of several equally good ones
@@ -133,7 +133,7 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
     mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
     words = f"if (x, y, z) is replaced by ({axes}){' (a mirror image)' if mirror else ''}"
-    yield _Change("point_mirrored", words, f"import the points with {axes} as x, y, z", errors[order, signs])
+    yield _Change("point_mirrored", words, f"write {axes} as x, y, z of the points in the file", errors[order, signs])
 
 
 def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[_Change]:
@@ -141,7 +141,7 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
         order = list(range(len(names)))
         order[i], order[j] = j, i
         words = f"if {names[i]} and {names[j]} are exchanged"
-        advice = f"exchange the names of {names[i]} and {names[j]}"
+        advice = f"exchange the names of {names[i]} and {names[j]} in the file"
         yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
 
@@ -194,13 +194,13 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
         return
     shift = b.mean(axis=0) - a.mean(axis=0)
     words = "shifted by ({:.3g}, {:.3g}, {:.3g}) m".format(*shift)
-    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame: {words}", _rms(a + shift - b))
+    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame, {words}", _rms(a + shift - b))
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
     left = _rms((a - a.mean(axis=0)) @ turn + b.mean(axis=0) - b)
     angle = math.degrees(math.acos(float(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
     words = f"turned by {angle:.3g} degrees and shifted"
-    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame: {words}", left)
+    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame, {words}", left)
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
@@ -237,7 +237,7 @@ def points_too_distant_issues(
             if mechanism.joints[root].parent_index < 0:
                 at = ca.densify(mechanism.joints[root].placement.translation)
                 fixed = np.array(ca.Function("at", [system.parameters.symbols], [at])(theta)).ravel()
-                pairs.append(((name, "the object's root"), places[name] - fixed, way[root]))
+                pairs.append(((name, "the object's root (first end)"), places[name] - fixed, way[root]))
         for (one, a), (two, b) in itertools.combinations(ways.items(), 2):
             if next(iter(a)) == next(iter(b)):
                 bound = min(a[i] + b[i] for i in a.keys() & b.keys())
@@ -251,10 +251,10 @@ def points_too_distant_issues(
             if far / allowed > worst:
                 # a point at the root has no information on a scale
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
-                words = f"{one} is measured {far:.3g} m from {two}, but the object allows at most {bound:.3g} m"
-                words += f" ({allowed:.3g} m is tolerated)"
+                words = f"{one} is measured {far:.3g} m from {two}, but along the object they are {bound:.3g} m apart"
+                words += f" (with allowances, {allowed:.3g} m is tolerated)"
         if worst > 1:
-            cause, advice = "point_reach", "check frame and names of the points, and the camera's pose"
+            cause, advice = "point_reach", "check model.object.mount, names and frame of the points, and the camera"
             if ratio > 5:
                 cause, advice = "point_scale", f"check the unit of positions (the factor is {ratio:.2g} or more)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
@@ -290,12 +290,13 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
     advice = "give positions in the world, not in the camera's frame"
     yield _Change("point_frame", "if the camera's pose is applied", advice, _rms(moved(pose) - place))
-    turned, advice = "if the camera's pose is inverted", "invert the pose: it must be that of the camera in the world"
+    turned, advice = "if the camera's pose is inverted", "invert the pose, which must be from camera to world"
     yield _Change("point_frame", turned, advice, _rms(moved(pose @ pose) - place))
     for i, axis in enumerate("xyz"):
         flip = np.eye(4)
         flip[i, i] = -1
-        words, advice = f"if the camera's {axis} axis is reversed", f"reverse the camera's {axis} axis"
+        words = f"if the camera's {axis} axis is reversed"
+        advice = f"reverse the sign of {axis} of these points in the camera's frame"
         yield _Change("point_mirrored", words, advice, _rms(moved(pose @ flip @ back) - place))
 
 
@@ -313,7 +314,8 @@ def cable_point_geometry_issues(cable: CableVertices, recording: Recording, grav
         if typical < low or typical > high:
             words = f"distances of neighbouring points are {typical:.3g} times those of the undeformed cable"
             words, depth = f"{words} ({low:g} to {high:g} times is tolerated)", max(typical / high, low / typical)
-            found[0] = Issue("point_scale", words, "not_trusted", depth, f"divide positions by {typical:.3g}", "")
+            advice = f"divide the positions in the file by {typical:.3g}"
+            found[0] = Issue("point_scale", words, "not_trusted", depth, advice, "")
         for issue in found:
             if issue is not None:
                 yield replace(issue, recording=recording.name, group=group.name)
@@ -342,7 +344,7 @@ def _exchanged(at: Mapping[str, Array], rest: Mapping[str, Array], edges: Sequen
     cause, advice = "point_reach", "check the names of the points"
     if least < 0.5 * off.sum():
         words += f". If {best[0]} and {best[1]} are exchanged, {int(off.sum()) - least} more such distances are right"
-        cause, advice = "point_swapped", f"exchange {best[0]} and {best[1]}"
+        cause, advice = "point_swapped", f"exchange the names of {best[0]} and {best[1]} in the file"
     return Issue(cause, words, "not_trusted", max(ratio[worst], 1 / ratio[worst]) / _MAX_EDGE_RATIO, advice, "")
 
 
@@ -367,6 +369,6 @@ def _upside_down(
         return None
     words = f"the cable's points are on average {height * span:.3g} m above its clamps ({allowed * span:.2g} m is "
     words += "tolerated), although gravity pulls down"
-    advice = "check which axis of the recording points up; if it is the opposite one, reverse gravity"
+    advice = "check which axis of the recording points up. If it is the opposite one, reverse gravity"
     line = f"model.gravity: [{', '.join(f'{x:g}' for x in 0.0 - gravity)}]"
     return Issue("point_mirrored", words, "not_trusted", height / allowed, advice, "", setting=line)

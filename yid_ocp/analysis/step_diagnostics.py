@@ -268,11 +268,11 @@ def step_jacobian_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, Sp
     torque, theta = _blocks(symbols, "u"), _blocks(symbols, "theta")
     by_theta = whole[:, symbols.row_or_column_block_slice("theta")]
     found = (
-        _pattern("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
-        _pattern("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),
-        _pattern("B_u", "B_u: state after a step by torques", response("u"), after, torque),
-        _pattern("B_theta", "B_theta: state after a step by parameters", response("theta"), after, theta),
-        _pattern("dR_dtheta", "dR/dtheta: equations by parameters", by_theta, every, theta),
+        _pattern("dR_dy", "dR/dy: derivative of a step's equations by its unknowns", by_unknown, residual, unknowns),
+        _pattern("A", "A: derivative of the next state by the state", response("q0", "p0", "z0"), after, before),
+        _pattern("B_u", "B_u: derivative of the next state by torques", response("u"), after, torque),
+        _pattern("B_theta", "B_theta: derivative of the next state by parameters", response("theta"), after, theta),
+        _pattern("dR_dtheta", "dR/dtheta: derivative of the equations by parameters", by_theta, every, theta),
     )
     return {pattern.name: pattern for pattern in found}
 

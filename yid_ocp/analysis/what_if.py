@@ -218,7 +218,7 @@ class _Outcomes:
         return [self.known[key] for key in keys]
 
     def _judged(self, sets: Sequence[Sequence[ExperimentChange]], _: float) -> list[ChangedExperimentResult]:
-        self.progress.begin_stage(f"judging {len(sets)} experiments")
+        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'changed experiment')}")
         found = []
         for done, changes in enumerate(sets):
             self.progress.report_parts_done(done, len(sets), _words(changes))

@@ -79,8 +79,8 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             what = f"{channel} repeats one value from {start:.4g} to {stop:.4g} s"
             what += f", {count} times (fewer than {least} are tolerated)" if is_unlikely else ""
             if turned > unseen:
-                what += f", although its velocity means a rotation by {turned:.2g} rad ({unseen:g} rad is tolerated)"
-            advice = "check the sensor, and cut out this time (Python: Recording.time_slice) or do not use the channel"
+                what += f", although its velocity says that it turns by {turned:.2g} rad ({unseen:g} rad is tolerated)"
+            advice = "check the sensor. Cut out this time (Python: Recording.time_slice), or do not use the channel"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
@@ -208,9 +208,9 @@ def overstated_noise_std_issues(recording: Recording, options: SensorOptionsFunc
         ratio, unit = stated / most[channel], JOINT_CHANNEL_UNITS.get(channel.partition(".")[0], "m")
         what = f"the noise of {channel} has a std of at most {seen_of[channel]:.2g}, not {stated:.2g} {unit} as stated"
         what += f" (too large for {len(low)} of {len(entries)} such channels)" if len(low) > 1 else ""
-        factor = f"{stated / seen_of[channel]:.3g} times as much ({QUALITY_LIMITS.max_overstatement_ratio:g} times is "
-        what += f". Stated is {factor}tolerated)"
-        advice = "the large std makes every ± too wide and hides small gaps: state the std of the actual noise"
+        factor = f"{stated / seen_of[channel]:.3g} times as large ({QUALITY_LIMITS.max_overstatement_ratio:g} times is "
+        what += f". The stated std is {factor}tolerated)"
+        advice = "the large std makes every ± too wide and hides small gaps. State the std of the actual noise"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
@@ -233,8 +233,8 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
                 what += f" (fewer than {least} such samples are tolerated)"
-                advice = "if the sensor measures torque, record within its range or cut out these times; "
-                advice += "if the efforts are a controller's commands, say so"
+                advice = "if the sensor measures torque, record within its range or cut out these times. "
+                advice += "If the efforts are a controller's commands, state this"
                 line, place = f"sensors.{JOINT_EFFORT_SENSOR_KEY}.effort_sampling_kind: command", (group, channel)
                 yield Issue("saturated", what, "not_trusted", at.sum() / least, advice, "", *place, begin, end, line)
 
@@ -326,7 +326,7 @@ class Issue:
     @property
     def certainty_word(self) -> str:
         """Certainty by `limit_violation_ratio`: `perhaps`, `likely` (from 1.5) or `certain` (from 3, or a count)."""
-        ratio, is_counted = self.limit_violation_ratio, self.cause == "few_samples"
+        ratio, is_counted = self.limit_violation_ratio, self.cause in ("few_samples", "dropped_samples", "gap")
         return "certain" if is_counted or ratio >= 3 else "perhaps" if ratio < 1.5 else "likely"
 
     @property

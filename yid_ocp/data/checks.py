@@ -103,9 +103,9 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
     what = f"the data that move the model have no samples for {length:.3g} s ({allowed:.2g} s is tolerated)"
     if jumped:
-        what += f", but the joints continue smoothly: the clock jumps by {length - median_sample_period(t):.3g} s"
+        what += f", but the joints continue smoothly, so the clock jumps by {length - median_sample_period(t):.3g} s"
     cause, group = "clock_jump" if jumped else "gap", "joints" if joints is not None else ""
-    advice = "find out why samples are missing; to use another part, cut it out (Python: Recording.time_slice)"
+    advice = "find out why samples are missing. To use another part, cut it out (Python: Recording.time_slice)"
     what, begin, end = f"{what}. {said}", float(t[gap]), float(t[gap + 1])
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
@@ -138,7 +138,7 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
                 what += f". If the times are in {unit}, the rate is {1 / (step * size):.4g} Hz"
-                advice += f" (in that case divide them by {1 / size:g})"
+                advice = f"if the times are in {unit}, divide them by {1 / size:g}"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
@@ -148,7 +148,7 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
             what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
-            advice = "check whether the file is complete; if it is, record some seconds of motion"
+            advice = "check whether the file is complete. If it is, record some seconds of motion"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 
@@ -162,9 +162,9 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
             epoch = (abs(begin) > _MIN_UNIX_TIME) != (abs(first) > _MIN_UNIX_TIME)
-            since = ", because one of their clocks counts from 1970" if epoch else f": {far:.3g} s lie between them"
+            since = "One of the clocks counts from 1970" if epoch else f"{far:.3g} s lie between them"
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
-            what, advice = f"joints were recorded {spans}{since}", "convert the times of all groups to one clock"
+            what, advice = f"joints were recorded {spans}. {since}", "convert the times of all groups to one clock"
             yield Issue("clock_base", what, "refused", LIMIT_VIOLATION_RATIO_CAP, advice, "", group.name, "t")
             continue
         slack = max(QUALITY_LIMITS.max_clock_mismatch_fraction * (last - first), 5 * median_sample_period(group.t))
@@ -173,8 +173,8 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         if late * over > 0 and abs(shift) > slack:
             how = f"starts {abs(late):.3g} s and ends {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
             what = f"{group.name} {how} than the joints ({slack:.3g} s is tolerated at one of the two ends)"
-            advice = "if the clocks differ, import again with --clock-offset FILE=SECONDS, which are added to the times"
-            advice += "; if not, cut out the common time (Python: Recording.time_slice)"
+            advice = "if the clocks differ, import again with --clock-offset FILE=SECONDS (added to the times). "
+            advice += "If not, cut out the common time (Python: Recording.time_slice)"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif (
             len(recording.points) == 1  # a note does not say which of several groups is late
@@ -184,10 +184,10 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         ):
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             late, lag = "late" if lag[0] == "-" else "early", lag.partition(":")[0]
-            what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the object swings behind the arm"
-            advice = f"compare points beside the gripper. If they are not {late}, the object swings: do nothing. "
-            advice += f"If they are, a damping would be wrong: import again with --clock-offset {option.rstrip(')')}, "
-            advice += "or let a fit estimate it"
+            what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the flexible object lags behind the arm"
+            advice = f"compare points beside the gripper with the angles. If they are not {late}, do nothing. If "
+            advice += "they are, a damping would be wrong. Then import again with --clock-offset "
+            advice += f"{option.rstrip(')')}, or let a fit estimate the offset"
             line = f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=line)
 
@@ -208,7 +208,7 @@ def _dropped(recording: Recording) -> Iterator[Issue]:
     if even > 0.9 and missing > QUALITY_LIMITS.max_missing_fraction:
         ratio, at = missing / (most := QUALITY_LIMITS.max_missing_fraction), f"the joint samples at {1 / base:.4g} Hz"
         what = f"{100 * missing:.2g} % of {at} are missing ({100 * most:g} % is tolerated)"
-        advice = "find out why they are missing; torques are interpolated between the remaining samples"
+        advice = "find out why they are missing. Until then, torques are interpolated between the remaining samples"
         yield Issue("dropped_samples", what, "warning", ratio, advice, "", "joints", "t")
 
 
@@ -245,11 +245,11 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     alike = bool(len(wrong) == len(known) and np.all(np.abs(ratio[known] / typical - 1) < 0.2))
     if alike and typical > 0 and len(known) >= min(2, len(names)):
         cause, channel = "time_scale", "t"
-        advice = f"multiply the times by {typical:.3g}, or correct the velocities"
+        advice = f"multiply the times in the file by {typical:.3g}, or correct the velocities"
         if abs(typical / math.degrees(1.0) - 1) < 0.1:
-            cause, channel, advice = "degrees", "position", "convert angles to radians"
+            cause, channel, advice = "degrees", "position", "convert the angles in the file to radians"
         elif abs(typical * math.degrees(1.0) - 1) < 0.1:
-            cause, channel, advice = "degrees", "velocity", "convert velocities to radians per second"
+            cause, channel, advice = "degrees", "velocity", "convert the velocities in the file to rad/s"
         what = f"all angles change {typical:.3g} times as fast as the recorded velocities state ({_RATES_TOLERATED})"
         ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
         yield Issue(cause, what, "not_trusted", ratio_beyond, advice, "", "joints", channel)
@@ -259,9 +259,9 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
         what = f"the angle of {names[j]} changes {ratio[j]:.3g} times as fast as its recorded velocity states"
         what += f" ({_RATES_TOLERATED})"
-        advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}, or correct the velocity"
+        advice = f"divide the angle of {names[j]} in the file by {ratio[j]:.3g}, or correct its velocity"
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
-            cause, evidence, advice = "angle_sign", LIMIT_VIOLATION_RATIO_CAP, f"reverse the sign of {names[j]}'s angle"
+            cause, evidence, advice = "angle_sign", LIMIT_VIOLATION_RATIO_CAP, f"multiply the angle of {names[j]} by -1"
         yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
 
 
@@ -274,7 +274,7 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
             own = max(abs(fit[i]), abs(fit[j]), 1e-3)
             what = f"the angle of {names[i]} changes like the velocity of {names[j]}, and vice versa (correlation "
             what += f"{min(across):.2g}), not like its own velocity (correlation {own:.2g})"
-            evidence, advice = min(across) / own, "exchange the columns of the two angles"
+            evidence, advice = min(across) / own, "exchange the columns of the two angles in the file"
             yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", f"position.{names[i]}")
 
 
@@ -293,7 +293,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         least = max(QUALITY_LIMITS.min_point_travel, noise)
         moved.append((size / least, f"{group.name} moves by at most {size:.2g} m (at least {least:.2g} m is needed)"))
     if moved and max(moved)[0] < 1.0:
-        advice = "record a motion: at rest, only weights and stiffnesses can be found"
+        advice = "record a motion. At rest, only weights and stiffnesses can be found"
         what = " and ".join(words for _, words in moved)
         yield Issue("standstill", what, "warning", 1 / max(max(moved)[0], 1e-3), advice, "")
 

@@ -55,12 +55,13 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
                 points = tuple(replace(group, clock_offset_std=_ALIGNED_CLOCK_STD) for group in recording.points)
                 recording = replace(recording, points=points)
         if said:
-            notes.append(f"the times of {recording.name} were shifted by {shift:+.4f} s, {said}" if shift else said)
+            shifts = f"the times of {recording.name} were shifted by {shift:+.4f} s, "
+            notes.append(f"{shifts if shift or recording.name in offsets else ''}{said}")
         shifted.append(_with_times_shifted(recording, shift))
     begin = min(float(group.t[0]) for recording in shifted for group in recording.all_groups)
     if abs(begin) > _LARGEST_START:
         shifted = [_with_times_shifted(recording, -begin) for recording in shifted]
-        notes.append(f"times now count from the first sample, which has the time {begin:.9g} s in its file")
+        notes.append(f"all times now count from the first sample, which has the time {begin:.9g} s in its file")
     groups, joints = [(r.name, r.joints) for r in shifted if r.joints is not None], None
     if groups:
         hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
@@ -106,17 +107,17 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
             return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
         if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
             share = f"which explains {best.explained:.0%} of their motion"
-            said += f", so nothing was shifted; but {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): their clock is "
-            said += "off, or the object swings behind the arm. `yid-ocp check` says how to decide; for a clock, import "
-            said += f"again with this option (--clock-offset {other.name}={-best.lag:.2g})"
+            said += f", so nothing was shifted. But {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): their clock is "
+            said += "off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the "
+            said += f"clock, import again with this option (--clock-offset {other.name}={-best.lag:.2g})"
         return 0.0, said
     if best is None or best.explained < _MIN_EXPLAINED:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
         hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
-    why = "because the recording times do not overlap; with this shift the points follow the joint angles best "
-    why += f"({best.explained:.1%} of the motion), to ± {_ALIGNED_CLOCK_STD:g} s, which a fit of the model corrects"
+    why = "because the recording times do not overlap. With this shift, the points follow the joint angles best "
+    why += f"({best.explained:.1%} of the motion). A fit of the model corrects its error (± {_ALIGNED_CLOCK_STD:g} s)"
     return begin - start - best.lag, why
 
 

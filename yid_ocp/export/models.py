@@ -142,9 +142,9 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 
 
 _READING = FeatureExportSupport(
-    "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}: correct the readings instead"
+    "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}. Correct the readings instead"
 )
-_NEUTRAL = FeatureExportSupport("native", "neutral: it changes nothing at this value, so the file omits it")
+_NEUTRAL = FeatureExportSupport("native", "it changes nothing at this value, so the file omits it")
 _UNUSED = FeatureExportSupport("native", "no motion or force of this model depends on it, so nothing is lost")
 
 

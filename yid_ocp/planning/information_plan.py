@@ -288,9 +288,9 @@ def _plan(
     w, message = chosen.w, "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "lower plan.limits, or set another plan.start_joint_positions"
-        message = f"the search could not improve the best of its random initial motions, which is the result; {way}"
+        message = f"the result is the best random initial motion. For the search to improve it, {way}"
     elif not chosen.is_converged:
-        message = f"a better motion may exist: the search ended after {chosen.n_iterations} rounds (max_iterations)"
+        message = f"a better motion may exist. The search ended at plan.max_iterations, {chosen.n_iterations} rounds"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

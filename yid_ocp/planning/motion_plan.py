@@ -254,17 +254,18 @@ def _outcome(
     broken = rows.worst_value_and_bound_by_violated_limit(rows.constraints_and_jacobian(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
-        message += f"; {name} exceeds its limit: its {what} reaches {value:.4g}, but the limit is {bound:.4g}"
+        message += f". The {what} of {name} reaches {value:.4g}, but the limit is {bound:.4g}"
     if not np.all(np.isfinite(rollout.state)):
-        message += "; the simulation failed before the end of the motion"
+        message += ". The simulation failed before the end of the motion"
     if broken:
-        message += "; set a longer plan.duration, a nearer target, or higher plan.limits if the robot allows it"
+        message += ". Set a longer plan.duration, a nearer target, or higher plan.limits if the robot allows it"
     # the motion with the smallest mean error need not reach the target at the most likely parameters
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
-    far = not error <= TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
+    most = TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
+    far = not error <= most
     if shot.is_converged and far:
-        message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its target"
-        message += "; set a longer plan.duration or a nearer target"
+        message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its target "
+        message += f"({1e3 * most:.3g} mm is tolerated). Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
     return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)

@@ -246,7 +246,7 @@ class MotionToTargetSearch:
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
-            message = f"a better motion may exist: the search ended after {iterations} evaluations (max_iterations)"
+            message = f"a better motion may exist. The search ended at plan.max_iterations, {iterations} evaluations"
         return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
@@ -420,7 +420,7 @@ class InformativeMotionSearch:
                     radius = min(2.0 * radius, _MAX_TRUST_RADIUS) if np.abs(step).max() > 0.9 * radius else radius
                     break
                 radius = max(0.3 * radius, 0.5 * _MIN_TRUST_RADIUS)
-            progress.report_parts_done(done, rounds, f"{value - first:.3g} nat beyond the start")
+            progress.report_parts_done(done, rounds, f"information raised by {value - first:.3g} nat")
             # if no step has any gain, the criterion is not smooth enough to be improved, as for a snapping object
             finished = gained < _MIN_GAIN and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:

@@ -222,7 +222,8 @@ class CameraCalibration:
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    text = f"clock offset {1e3 * offset:.0f} ms as specified" + f" (not estimated, because {reason})" * bool(reason)
+    text = f"The camera's clock offset is {1e3 * offset:.0f} ms as specified"
+    text += f" (not estimated, because {reason})" * bool(reason)
     state = CameraState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
@@ -317,7 +318,7 @@ class _Calibrator:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
         beside = state.state_increment_from(used_state)
         words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
-        words += f"; from {len(chosen)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds"
+        words += f". These values are from {len(chosen)} images, which show {100 * presence.there:.0f} % of the arm"
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: StampedCloud) -> StampedCloud | None:
@@ -383,11 +384,11 @@ class _Calibrator:
 
     def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
         stds = np.sqrt(np.diag(covariance))
-        known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
         searched = self.clock.search_half_width > 0
-        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms {known if searched else 'as specified'}"]
+        known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms" if searched else "ms as specified"
+        words = [f"The camera's clock offset (stamp minus joint time) is {1e3 * state.clock_offset:.1f} {known}"]
         if abs(state.clock_drift) > 2 * (drift := stds[CLOCK_DRIFT_INDEX]):
-            words.append(f"clock drift {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")
+            words.append(f"It drifts by {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")
         points = self.arm.visible_surface_points_and_parts(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change, gap_text = state.state_increment_from(self.told), f"{1e3 * away:.0f} mm"
@@ -396,11 +397,11 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = f"the arm contradicts the fixed pose of the camera by {gap_text}, part of each point's std"
-                words.append(f"{off} (to correct the pose, set track.options.calibration.fix_pose: false)")
+                off = f"The arm contradicts the fixed pose of the camera by {gap_text}, a part of each point's std"
+                words.append(f"{off}. To correct the pose, set track.options.calibration.fix_pose: false")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
-            off = f"the camera at its specified pose sees the arm {gap_text} from its place by the joints"
-            moved = f"its pose is corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm"
-            words.append(f"{off}; {moved}, its depth is {math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times the true one")
-        return "; ".join(words)
+            off = f"With its specified pose, the camera sees the arm {gap_text} from its place by the joint angles"
+            moved = f"Its pose is corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm, and its depth"
+            words.append(f"{off}. {moved} ({math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times the true one) as well")
+        return ". ".join(words)

@@ -108,23 +108,23 @@ _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a n
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str | None:
     """Return the reason to reject a frame for its own fit, regardless of other frames. None if it is good."""
     if not np.isfinite(fit.q).all():
-        return "the fit of the shape failed, its angles are not finite"
+        return "the fit of the shape failed (its angles are not finite)"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest = options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean())
     limit = math.hypot(widest, _MEAN_ABS_DEVIATION * shape.options.surface_noise_std)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
-        off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, max_mean_surface_distance_in_radii"
-        return f"{_NO_FIT}: {off} allows {1e3 * limit:.1f} mm"
+        most = f"track.options.max_mean_surface_distance_in_radii allows only {1e3 * limit:.1f} mm"
+        return f"{_NO_FIT}: points are {1e3 * fit.mean_distance:.1f} mm from it on average, but {most}"
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > _MAX_BEND_ANGLE:
-        most = f"{math.degrees(_MAX_BEND_ANGLE):.0f} degrees are allowed"
+        most = f"but only {math.degrees(_MAX_BEND_ANGLE):.0f} degrees are allowed"
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees, {most}"
     if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
         seen, least = (100 * x for x in (fit.visible_length_coverage, options.min_covered_visible_length_fraction))
-        off = f"only {seen:.0f} % of its visible length has points of its own, min_covered_visible_length_fraction"
-        return f"{_NO_FIT}: {off} requires {least:.0f} %"
+        most = f"track.options.min_covered_visible_length_fraction requires {least:.0f} %"
+        return f"{_NO_FIT}: only {seen:.0f} % of its visible length has points of its own, but {most}"
     return None
 
 
@@ -142,12 +142,12 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], grasped: Sequ
         apart = float(shifts.max(initial=0.0))
         if fit.mean_distance > limit:
             off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, but only {1e3 * limit:.1f} mm are"
-            most = f"allowed ({_MAX_DISTANCE_OVER_MEDIAN} times the median of all frames). A part may be hidden"
-            reason = f"the shape fits worse than in other frames: {off} {most}"
+            most = f"allowed ({_MAX_DISTANCE_OVER_MEDIAN} times the median of all images). A part may be hidden"
+            reason = f"the shape fits worse than in other images: {off} {most}"
         elif apart > _MAX_GRASP_GAP_CHANGE:
-            most = f"{1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed. The frame's time stamp may be late"
+            most = f"({1e3 * _MAX_GRASP_GAP_CHANGE:.0f} mm are allowed). The time stamp of this image may be late"
             at = f"the distance of {grasped[int(np.argmax(shifts))]} from its gripper"
-            reason = f"{_END_ELSEWHERE}: {at} differs by {1e3 * apart:.0f} mm from that in most frames; {most}"
+            reason = f"{_END_ELSEWHERE}: {at} differs by {1e3 * apart:.0f} mm from that in most images {most}"
         made[k] = replace(frames[k], drop_reason=reason)
     return made
 
@@ -252,7 +252,7 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
     if not two:
         near = "is the end nearest to track.options.approximate_root_position"
         said = "follows from the object's lengths and branches" if options.approximate_root_position is None else near
-        return _fixed(frames, options), f"the object's root {said}"
+        return _fixed(frames, options), f"The object's first end (root) {said}"
     made, last = list(frames), None
     for k in fitted:
         other_fit = made[k].alternative_fit
@@ -265,16 +265,16 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
     between = float(np.median(np.linalg.norm(roots - tips, axis=1)))
     own = float(np.median(np.linalg.norm(roots - _ends(made[k].alternative_fit for k in two)[0], axis=1)))
     if own < _SAME_ROOT_FRACTION * between:
-        other, said = False, "is determined; equal branches are followed from frame to frame, and may be exchanged"
+        other, said = False, "is known. Equal branches are followed from image to image, and may be exchanged"
     elif options.root_placement == "fixed" and max(moving) > _FIXED_ROOT_MOTION_RATIO * min(moving):
         other, said = moving[0] > moving[1], "is the end that stays in its place"
     elif abs(above) > _HANGING_HEIGHT_FRACTION * between:
         other, said = above < 0, "is the higher end"
     else:
-        other, said = False, "may be at either end, so one was chosen; set track.options.approximate_root_position"
+        other, said = False, "is one of two possible ends. If it is wrong, set track.options.approximate_root_position"
     if other:
         made = [_exchanged(frame) for frame in made]
-    return _fixed(made, options), f"the object's root {said}"
+    return _fixed(made, options), f"The object's first end (root) {said}"
 
 
 def _exchanged(frame: FrameReport) -> FrameReport:
@@ -302,8 +302,9 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
-                off = f"{1e3 * away:.0f} mm away, {1e3 * most:.0f} mm are allowed (root_placement: free allows more)"
-                reason = f"the object's first end (root) is not where other frames have it: {off}"
+                off = f"it is {1e3 * away:.0f} mm away ({1e3 * most:.0f} mm are allowed). If this end moves, set "
+                reason = f"the object's first end (root) is not where other images have it: {off}"
+                reason += "track.options.root_placement: free"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made
 

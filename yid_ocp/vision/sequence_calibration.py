@@ -123,8 +123,9 @@ def foreign_clusters_to_objects(
         beside = bool(((low > box[1]) | (high < box[0])).any())
         how = f"moving with {link}" if link else "moving" if moving else "static"
         big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
-        text = f"a foreign object of {big} m is at ({where}) m ({how}, in {len(group)} of {len(clusters)} frames): "
-        boxed = "leave it out with track.options.filters.box_lower and box_upper"
+        text = f"A foreign object of {big} m is at ({where}) m ({how}, in {len(group)} of {len(clusters)} images). "
+        text += "To remove its points, "
+        boxed = "set track.options.filters.box_lower and box_upper so that it is outside"
         if link:
             text += f"give its shape under model.surfaces_missing_from_urdf with parent_frame: {link}"
         elif moving:
@@ -133,8 +134,8 @@ def foreign_clusters_to_objects(
         else:
             text += "" if background else "set track.options.background_estimation: frames, or "
             text += "record the scene without object and robot for track.background_frames_path"
-            text += f"; or {boxed}" if beside else ""
-            text += "; if it is another arm, lock its joints (model.arms.locked_joints)" if poses[0] else ""
+            text += f", or {boxed}" if beside else ""
+            text += ". If it is another arm, lock its joints (model.arms.locked_joints)" if poses[0] else ""
         found.append(ForeignObject(centre, size, len(group), moving, link, text))
     return tuple(found)
 
@@ -214,13 +215,13 @@ class TubeDimensionEstimates:
         for i, name in enumerate(self.names):
             value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
             two = 2 * value * self.dimension_log_ratio_std[i]
-            found = f"{value:.4g} mm ± {two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
-            said = f"the model says {1e3 * self.model_values[i]:.4g} mm"
+            found = f"{value:.4g} ± {two:.2g} mm (two standard deviations) fits {self.n_frames} images, but the model "
+            found += f"says {1e3 * self.model_values[i]:.4g} mm"
             if self.estimated_dimension_mask[i]:
-                lines.append(f"{name} is estimated: {found}; {said}")
+                lines.append(f"{name} is estimated: {found}")
             elif self.contradicted_model_value_mask[i]:
                 remedy = f"set track.options.estimated_dimensions: [{name.rpartition('.')[2]}] to estimate it"
-                lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
+                lines.append(f"{name} seems to be wrong: {found}. Measure it again, or {remedy}")
         return tuple(lines)
 
     def point_std_from_dimensions(self, points: Array) -> Array:

@@ -387,7 +387,7 @@ class SingleFrameTracker:
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
-            raise dropped_frame_error("no joint angles were recorded at the time of the frame")
+            raise dropped_frame_error("no joint angles were recorded at the time of the image")
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
@@ -395,7 +395,7 @@ class SingleFrameTracker:
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if own.is_significant:
-                    late = f"the frame's time stamp is {'late' if own.delay > 0 else 'early'}"
+                    late = f"the image's time stamp is {'late' if own.delay > 0 else 'early'}"
                     raise dropped_frame_error(f"{late}: it is {1e3 * abs(own.delay):.0f} ms off the camera's clock")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
@@ -481,12 +481,12 @@ def _joint_angles(
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
     """Indices of the frames by time stamp, and why frames without a stamp or with a repeated stamp are dropped."""
-    reasons = {int(i): "the frame's time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
+    reasons = {int(i): "the image's time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
     for i in (i for i in order if i not in reasons):
         if stamps[i] - before < _SAME_TIME_TOLERANCE:
-            reasons[i] = "the frame's time stamp equals that of another frame, so it is a duplicate"
+            reasons[i] = "the image's time stamp equals that of another image, so it is a duplicate"
         else:
             before = float(stamps[i])
     return tuple(order), reasons

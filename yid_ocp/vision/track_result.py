@@ -98,15 +98,15 @@ class TrackResult:
         """Convert the points to the point group `points_camera` of a recording."""
         pose, words = self.camera_calibration.camera_state.pose, "depth camera, fitted shape"
         if np.nanmax(self.shared_std) > 0:
-            words += f"; of std, {1e3 * np.nanmedian(self.shared_std):.1f} mm (median) are one error of all frames"
+            words += f"; all frames share an error of {1e3 * np.nanmedian(self.shared_std):.1f} mm (a part of std)"
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, "world", pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
         """Return a copy of a recording (None: an empty one) with these points as `points_camera`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
-        count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
-        text = f"{recording.description} {count}; {self.camera_calibration.message}."
+        count = f"Points are from {len(self.t)} of {len(self.frame_reports)} images"
+        text = f"{recording.description} {count}. {self.camera_calibration.message}."
         made = replace(recording, points=(*others, self.to_point_group()), description=text.strip(), sha256=None)
         # the positions of a straight object belong to the group that a file lists first
         if not others or others[0] is not recording.points[0] or others[0].name > _CAMERA_POINT_GROUP:
@@ -155,11 +155,11 @@ def _pictures(stages: SingleFrameStages) -> list[_Picture]:
         made.append(_Picture("filtered", f"{len(near)} points of the object", [(near, _BLUE, 1.5)]))
     if near is not None and skeleton is not None:
         faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
-        made.append(_Picture("skeleton", f"{len(skeleton.nodes)} nodes of the skeleton", [faint, nodes]))
+        made.append(_Picture("skeleton", f"{len(skeleton.nodes)} points along the object (skeleton)", [faint, nodes]))
         parts = count_with_noun(len(set(skeleton.component_of_node.tolist())), "connected part")
         made.append(_Picture("graph", f"{count_with_noun(len(edges), 'edge')}, {parts}", [nodes], list(edges), _BLUE))
         if fit is not None:
-            off = f", {1e3 * fit.mean_distance:.1f} mm from the points on average (frame used)"
+            off = f", {1e3 * fit.mean_distance:.1f} mm from the points on average (image used)"
             title = "fitted shape" + ("" if stages.report.drop_reason else off)
             places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
             made.append(_Picture("fit", title, places, list(fit.link_ends), _GREEN))
@@ -210,7 +210,7 @@ def write_tracked_points_plot(track: TrackResult, file: str | os.PathLike[str]) 
             panel.axvline(t, color=_GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
-    said = "positions about their mean, with two standard deviations; dotted: dropped frames"
+    said = "positions minus their mean, ± two standard deviations. Dotted lines: images that are not used"
     axes[0].set_title(f"{said}\n{track.camera_calibration.message}", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     with atomic_write(Path(file)) as temporary:

@@ -118,7 +118,7 @@ def run_blind(
         progress.begin_stage("scoring")
         best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
-        log.warning("the finished cases are kept in %s; the same command continues with the others", proof.folder)
+        log.warning("the finished cases are kept in %s. The same command continues with the others", proof.folder)
         raise
     flags = ["--cases", count, "--seed", seed]
     flags += ["--calibration"] if purpose == blind.BLIND_ENSEMBLE_PURPOSES[1] else []

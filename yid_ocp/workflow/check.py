@@ -13,7 +13,7 @@ from yid_ocp.analysis import discretisation, step_diagnostics
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, count_with_noun
 from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.urdf import read_urdf
@@ -95,7 +95,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
-            warnings.append(f"{path.name} is not compared, because Pinocchio cannot read it: {error} (no run needs it)")
+            warnings.append(f"{path.name} is not compared, because Pinocchio cannot read it: {error}. No run needs it")
     warnings += [entry.words for entry in found.values() if not entry.agrees_within_rounding]
     return {n: {**asdict(e), "agrees": e.agrees_within_rounding, "words": e.words} for n, e in found.items()}
 
@@ -117,12 +117,13 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     if arm is not None:
         recorded = 1.0 / float(np.median(np.diff(arm.t)))
         if recorded < 0.5 * rate:
-            said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). Motion in between is "
-            warnings.append(f"'{episode.name}' has joint samples at {said}interpolated: if possible, sample faster")
+            said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). The motion in "
+            said += f"between is interpolated. If possible, record at {0.5 * rate:.4g} Hz or more"
+            warnings.append(f"'{episode.name}' has joint samples at {said}")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            said = f"are samples or commands, so they are taken as {arm.effort_sampling_kind_or_default}s. If this is "
-            said += "wrong, set sensors.joints.effort.effort_sampling_kind"
+            said = f"are samples, means or commands, so they are taken as {arm.effort_sampling_kind_or_default}s. If "
+            said += "this is wrong, set sensors.joints.effort.effort_sampling_kind to mean or command"
             warnings.append(f"'{episode.name}' does not state whether efforts {said}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
@@ -216,8 +217,9 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
-        grow = f"{own.n_unstable_modes} vibration modes grow from step to step at the first posture, so the simulation "
-        warnings.append(f"{grow}is unstable: set a shorter problem.time_step, {remedy}or a larger model.damping")
+        grow = f"at the first posture, {count_with_noun(own.n_unstable_modes, 'vibration')} of the model would grow in "
+        grow += "every step, so the simulation is unstable. Set a shorter problem.time_step, "
+        warnings.append(f"{grow}{remedy}or a larger model.damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
@@ -240,10 +242,10 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
 
 def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row."""
-    coarse, fine, remedy = rows[0], rows[-1], "a shorter one" if unit else "more links"
+    coarse, fine, remedy = rows[0], rows[-1], "set a shorter problem.time_step" if unit else "use more links"
     for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}: use {remedy}"
+            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}. If this vibration matters, {remedy}"
             limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
             moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
             warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")

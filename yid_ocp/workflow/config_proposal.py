@@ -279,7 +279,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if closed:
         return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
-        return "prescribed", f"the arm moves as measured, because it carries the object and {seen} show how the object moves"
+        return "prescribed", f"the arm moves as measured, as it carries the object, and {seen} show the object"
     return "prescribed", "the arm moves as measured; its efforts show the object, because no other sensor does"
 
 
@@ -405,17 +405,18 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} times the object's length away from {holder}. Check the frame of the recorded positions"
+            return "", f"it is {part:.1f} object lengths away from {holder}. Check the frame of its positions"
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
-        beyond = " (beyond the end: check length, frame and clocks)" if part > 1.05 else ""
-        return _along(branch.name, min(100, percent)), f"it is at most {part:.1%} of the length away from {holder}{beyond}"
+        why = f"it is at most {part:.1%} of the length away from {holder}"
+        why += " (beyond the end, so check length, frame and clocks)" if part > 1.05 else ""
+        return _along(branch.name, min(100, percent)), why
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
     if apart[name] > 0.5 * max(branch.length for branch in branches):
-        return "", f"it is {apart[name]:.2g} m away from the straight object. Check the frame of the recorded positions"
+        return "", f"it is {apart[name]:.2g} m away from the straight object. Check the frame of its positions"
     return name, f"it is {1e3 * apart[name]:.0f} mm from this frame when the object is straight"
 
 
@@ -429,7 +430,7 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
     for key, group, channel in _mounted_channels(recording):
         other = ("", "no link has this name. To use it, set {frame_by_recorded_name: {NAME: FRAME}, use: true}")
         if channel.group == "wrist":
-            other = (holder, "a wrist sensor usually carries this link and its load. If not, set frame_by_recorded_name")
+            other = (holder, "a wrist sensor usually carries this link. If it does not, set frame_by_recorded_name")
         own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
         found[key] = tuple(
             _PointPlacement(name, name, "their names are equal") if moves else _PointPlacement(name, *other)

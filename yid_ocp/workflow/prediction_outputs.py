@@ -94,12 +94,14 @@ def copyable_estimate_texts(
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
             sizes = {term: [at[term] for at in own if term in at] for term in ("stiffness", "damping")}
             count = len(layout.link_joints)
-            note = f"{' '.join(key)}, {count} links; n links: times n/{count}"
+            note = f"{' '.join(key)}, {count} links; for n links, multiply by n/{count}"
             if stiffness := sizes["stiffness"]:
                 low, high = min(stiffness), max(stiffness)
                 known = {"segment": key[0], "deformation": key[1], "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
-                note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
+                note += (
+                    f"; joints have {low:.4g} to {high:.4g}, see `yid-ocp export`" if high - low > 1e-9 * high else ""
+                )
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}

@@ -209,7 +209,7 @@ def _read_bag(
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = tuple(_mounted_sensors(bag, groups, seconds))
     if channels and channels[-1].name == ESTIMATED_WRENCH_GROUP_NAME:
-        said = "the driver's estimate from the joint torques, without the loads that it knows"
+        said = "computed by the robot's driver from the joint torques, without the loads that it knows"
         more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}. Use it in place of the efforts, not with them")
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
@@ -218,7 +218,7 @@ def _read_bag(
         said += "import again with --pose-axis-point-distance 0.1: it adds points 0.1 m away on the axes of each pose"
         more = (*more, said)
     left = [f"{t.name} was left out ({t.n_messages} of {t.kind})" for t in bag.file.topics if t.name not in used]
-    left += ["if you need a topic that was left out, `yid-ocp import --preview` says how to import it"] * bool(left)
+    left += ["`yid-ocp import --preview` says how to import a topic that was left out, if you need it"] * bool(left)
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
@@ -563,7 +563,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
     becomes, note = "", f"its type is not known. For joint values, add --field position={topic.name}.FIELD"
     if topic.kind in OTHER_JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
-        note = f"joints, left out because the bag has joint states. To use them: --joint-topic {topic.name}"
+        note = f"joints, left out because the bag has joint states. To use them, add --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
@@ -575,7 +575,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
         becomes, note = f"{_GROUP_BY_MESSAGE_TYPE[topic.kind]} on {frames or topic.name}", ""
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
-        note = f"frames {', '.join(children)}. To use one: --points {topic.name}:FRAME=POINT"
+        note = f"frames {', '.join(children)}. To use one, add --points {topic.name}:FRAME=POINT"
     return base.TopicOrColumnSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
 
 

@@ -215,7 +215,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     sources = []
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out: meaning unknown"
+        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out, its meaning is unknown"
         rate = mean_sample_rate(t) if ok else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are not rows of numbers. --skip-bad-lines leaves them out"] if bad else []
