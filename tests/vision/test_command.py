@@ -54,7 +54,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     assert whole.code == 0, whole.err
     assert "3 of 3 frames are used" in whole.out
     assert "w_T1" in whole.out
-    assert "tracking" in whole.err
+    assert "fitting the object in every image" in whole.err
     made = read_recording(whole.folder / "recording.h5")
     group = next(group for group in made.points if group.name == "points_camera")
     assert group.names == ("w_T1", "w_T3")

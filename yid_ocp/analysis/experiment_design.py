@@ -235,7 +235,7 @@ class ExperimentVariantSensitivityBuilder:
         if setup_changes not in self._layouts:
             if setup_changes:
                 words = " and ".join(SETUP_CHANGE_DESCRIPTIONS[name] for name in sorted(setup_changes))
-                self._progress.begin_stage(f"working out {words}")
+                self._progress.begin_stage(f"simulating with {words}")
             try:
                 self._layouts[setup_changes] = self._build(setup_changes)
             except YidError as error:

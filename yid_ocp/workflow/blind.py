@@ -115,7 +115,7 @@ def run_blind(
         answers = proof.done(_diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.read_labels_checking_sha256(sealed, commitment["sha256"])
-        progress.begin_stage("scoring")
+        progress.begin_stage("comparing the diagnoses with the labels")
         best = proof.best_closures(cases, labels, answers)
     except KeyboardInterrupt:
         log.warning("the finished cases are kept in %s. The same command continues with the others", proof.folder)
@@ -203,7 +203,7 @@ class _Proof:
         told = {name: {"experiment": vars(experiments[name])} for name in used}
         tasks = [Task(name, {**told[name], "folder": str(prepared), "name": name}) for name in used]
         self.done(_prepare_experiment, tasks, prepared / "tasks")
-        self.progress.begin_stage(f"making {len(plan)} cases")
+        self.progress.begin_stage(f"simulating {len(plan)} cases")
         tasks = []
         for entry in plan:
             name = entry.experiment

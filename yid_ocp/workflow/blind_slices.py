@@ -148,7 +148,7 @@ def rescore_blind(
     changes = {name: getattr(wanted, name) for name in names if hasattr(wanted, name)}
     marks, changed = [], []
     answers, best = _stored_values(made / "answers"), _stored_values(made / "best")
-    progress.begin_stage(f"judging {len(answers)} of {commitment['cases']} cases")
+    progress.begin_stage(f"comparing with the labels {len(answers)} of {commitment['cases']} cases")
     for case, found in sorted(answers.items()):
         label, then, now = labels[case], found["result"], found["result"]
         if found.get("evidence") is not None:

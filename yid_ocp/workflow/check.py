@@ -54,9 +54,9 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             problem = build_problem(run, step)
             for role, episodes in (("estimate", problem.episodes), ("held_out", problem.held_out)):
                 recordings += [_recording(problem, role, episode, warnings) for episode in episodes]
-        progress.begin_stage("comparing the bodies with another library")
+        progress.begin_stage("comparing masses and inertias with the library Pinocchio")
         mechanics = _mechanics(run, step, problem, warnings)
-        progress.begin_stage("refining links and time step")
+        progress.begin_stage("testing whether links and time step are fine enough")
         convergence = _frequency_convergence(run, problem, warnings)
         moved, shown = {}, {}
         if problem is not None:

@@ -25,7 +25,7 @@ from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough
 from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
 from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
@@ -117,7 +117,7 @@ def run_identifiability(
             tasks = _IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
-            progress.begin_stage("Fisher information")
+            progress.begin_stage("computing the Fisher information")
             judged = partial(fisher.identifiability, problem, solution, limits=limits)
             unknown = judged(start="unknown", grasp_std=GRASP_OFFSET_PRIOR_STD)
             judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)

@@ -133,9 +133,9 @@ def recording_issue_lines(recording: Recording) -> list[str]:
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
-    said = [f"issue ({issue.certainty_word}): {issue.what}\n  {issue.advice}" for issue in found]
+    said = [f"issue ({issue.certainty_word}): {issue.what}\n  try: {issue.advice}" for issue in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        said.append(f"issue (likely): {reason}\n  import again with --units {quantity}={unit}")
+        said.append(f"issue (likely): {reason}\n  try: import again with --units {quantity}={unit}")
     return ["", *said] if said else []
 
 

@@ -65,7 +65,7 @@ def _run_inspect(
             parameters.index(name)
         chosen = [symbols.equation_or_derivative_by_name(text) for text in entries if text.strip() not in named]
         free = free_parameter_names(run, parameters)
-        progress.begin_stage("linearising")
+        progress.begin_stage("linearising the equations of a step")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
         point = _point(step, problem)
         matrices, rows = _linearised(step, point)

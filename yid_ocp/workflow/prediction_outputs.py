@@ -99,9 +99,7 @@ def copyable_estimate_texts(
                 low, high = min(stiffness), max(stiffness)
                 known = {"segment": key[0], "deformation": key[1], "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
-                note += (
-                    f"; joints have {low:.4g} to {high:.4g}, see `yid-ocp export`" if high - low > 1e-9 * high else ""
-                )
+                note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
     labels = {n: n.replace("_", r"\_") for n in found}

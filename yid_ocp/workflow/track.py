@@ -62,9 +62,9 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
                 issues = [] if recording is None else data_quality_issues_of_recording(run, system, recording)
-                progress.begin_stage("calibrating the sequence")
+                progress.begin_stage("estimating pose, depth and clock of the camera")
                 common = tasks.estimate_shared_values()
-                progress.begin_stage("tracking")
+                progress.begin_stage("fitting the object in every image")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
                 frames, note = tracker.align_root_ends_and_mark_outlying_frames(done)
                 try:
@@ -74,7 +74,7 @@ def _run_track(
         except YidError:
             tasks.delete_files()
             raise
-        progress.begin_stage("drawing")
+        progress.begin_stage("drawing pictures")
         for frame in _drawn(frames, settings.n_drawn_frames):
             stages = tracker.frame_clouds_and_skeleton(frame, common)
             if stages is not None:
@@ -314,7 +314,7 @@ def _frame_tasks(
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
         recording, made = _simulate_recording_and_camera_frames(run, system)
-        progress.begin_stage("rendering its camera frames")
+        progress.begin_stage("rendering its depth images")
         work.mkdir(parents=True, exist_ok=True)
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
         write_frame_folder(made.sequence, frames)

@@ -85,7 +85,7 @@ def _read_lerobot_episode(
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
     where = f"{dataset.folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
-        why = f"{_PERCENT}, not as an angle. State a fixed angle in model.arms.locked_joints"
+        why = f"{_PERCENT}, so state a fixed angle in model.arms.locked_joints"
         left |= dict.fromkeys(_grippers(names), why)
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
