@@ -126,7 +126,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     file.write_text(MODELS["arm with a gripper"].replace("</worldbody>", cube))
     mechanism = read_urdf(file)
     read_urdf(file)
-    assert caplog.text.count("leaves out motors (1 in the file). Their limits are kept") == 1
+    assert caplog.text.count("leaves out motors (1 in the file). Efforts count as torques") == 1
     assert "actuators other" not in caplog.text
     assert "equalities" not in caplog.text  # the second finger follows the first
     assert "finger2" not in mechanism.joint_names

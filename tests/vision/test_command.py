@@ -52,7 +52,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     from matplotlib.image import imread  # half a second
 
     assert whole.code == 0, whole.err
-    assert "3 of 3 frames are used" in whole.out
+    assert "3 of 3 images are used" in whole.out
     assert "w_T1" in whole.out
     assert "fitting the object in every image" in whole.err
     made = read_recording(whole.folder / "recording.h5")

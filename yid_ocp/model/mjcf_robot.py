@@ -188,7 +188,7 @@ def _left_out(model: Any) -> Iterator[str]:
     others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
     motors = sum(_is_motor(model, i) for i in others_than_servos)
     others = {
-        "motors": (motors, "Their limits are kept, and efforts are torques at the joint"),
+        "motors": (motors, "Efforts count as torques at the joint, and the motors' limits are kept"),
         "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
         "equalities": (model.neq - taken, "For a weld or connect that closes a loop, set model.grasp"),
         "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "To have them, set model.joint_springs"),

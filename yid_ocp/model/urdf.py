@@ -330,7 +330,7 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
         raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
         what = "%s: link '%s' has principal moments of inertia of %s kg m^2, but in any body the largest is at most "
-        log.warning(what + "the sum of the others. They are used unchanged: check <inertia>", where, link, values)
+        log.warning(what + "the sum of the others. They are used unchanged. Check <inertia>", where, link, values)
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:

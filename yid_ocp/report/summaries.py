@@ -495,7 +495,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
-    rows: TableRows = [("point", "frames", "± std [mm]", *heads)]
+    rows: TableRows = [("point", "images", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
@@ -504,9 +504,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} frames are used. One fit took {spent:.0f} ms."
+    said = result["refused"] or f"{good} of {len(result['frames'])} images are used. One fit took {spent:.0f} ms."
     yield SummaryStatement(said, "verdict")
-    yield from (f"{count_with_noun(n, 'frame')} left out, because {reason}" for reason, n in result["dropped"].items())
+    yield from (f"{count_with_noun(n, 'image')} left out, because {reason}" for reason, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 

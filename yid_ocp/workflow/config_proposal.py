@@ -520,7 +520,7 @@ def _clock(group: JointGroup | PointGroup) -> str:
     if not len(steps):
         return "one sample"
     uneven = float(np.std(steps) / np.mean(steps))
-    said = f"{mean_sample_rate(group.t):.4g} Hz, with {group.clock} times"
+    said = f"{mean_sample_rate(group.t):.4g} Hz, with {'recorded' if group.clock == 'recorded' else 'computed'} times"
     if uneven >= 0.01:
         said += f", whose periods vary by {uneven:.0%}"
     if isinstance(group, PointGroup) and group.clock_offset_std is not None:

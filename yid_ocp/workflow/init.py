@@ -187,7 +187,7 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "object held by" if proposal.has_object else "no object; a payload is assumed at the frame"
+    carried = "object held by" if proposal.has_object else "no object is given; a payload is assumed at"
     lines = [
         f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
         f"{carried}: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),

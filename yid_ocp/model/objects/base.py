@@ -130,7 +130,7 @@ class InitialObjectSettings:
 
     settings: ObjectBuilder  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # initial value of each free parameter, with a comment
-    parameters_comment: str = "`yid-ocp inspect` lists all that there are"
+    parameters_comment: str = "`yid-ocp inspect` lists all parameters"
     # whether its root is fixed in the world and arms hold its ends; otherwise a robot frame carries its root
     stands_in_world: bool = False
 
@@ -181,8 +181,8 @@ def initial_parameters_with_comments(
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
-        found[f"{s.name}.bend"] = bend, "bending rigidity [N m^2], where the search starts"
-        found[f"{s.name}.damping"] = _DAMPING_TIME * bend, "[N m^2 s]"
+        found[f"{s.name}.bend"] = bend, "bending rigidity [N m^2], initial value of the fit"
+        found[f"{s.name}.damping"] = _DAMPING_TIME * bend, "viscous damping [N m^2 s], initial value of the fit"
     return found
 
 
