@@ -232,16 +232,16 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     before = finding.nominal_model.values | {name: values["after"] / 2}
     moved = replace(finding, nominal_model=replace(finding.nominal_model, values=before))
     tried = text_of(page_of(replace(moved, verdict="unknown", unknown_reason="none"), tmp_path))
-    assert "the errors with joint_coulomb@elbow, which was not accepted" in tried
+    assert "the errors with joint_coulomb@elbow, not accepted as cause" in tried
     lost = moved.nominal_model.held_out_loss
     quiet = replace(moved.nominal_model, held_out_loss=replace(lost, block_chi2=0 * lost.block_chi2, baseline_chi2=0.0))
     assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(moved, nominal_model=quiet), tmp_path))
     text = text_of(page_of(moved, tmp_path))
     assert "The error of joints.effort.elbow changes most" in text
-    assert "every coordinate of the nominal model (without the effects that explain the gap) an" in text
+    assert "Of the error beyond noise that can be located, " in text
     assert "would have been detected" in text
-    assert "Most probably the origin of the gap is the mechanics or the effort sensor, which" in text
-    assert "The values are joint_coulomb@elbow" in text
+    assert "Most probably the gap of the nominal model comes from the mechanics or the effort sensor, which" in text
+    assert "The best are joint_coulomb@elbow" in text
     assert "No two signatures are similar in both directions" in text
     assert "The most significant value is that of elbow" in text
     assert f"{name} goes from" in text
@@ -255,7 +255,7 @@ def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tm
     vague = replace(trace, posterior_std=np.broadcast_to(0.9 * prior, trace.posterior_std.shape))
     page = page_of(replace(finding, smoother_result=replace(smoothed, smoothed_unknowns=(vague,))), tmp_path)
     assert "value in standard deviations of its prior" in page
-    assert "The picture is only a hint." in text_of(page)
+    assert "The map is only a hint." in text_of(page)
 
 
 def test_a_result_alone_gives_words_and_tables(found, tmp_path):

@@ -133,7 +133,7 @@ def _examined(
     limits = search.thresholds
     search, nominal, cuts = _followed(search, nominal, known)
     search.record_stage_end_time("nominal")
-    search.progress.begin_stage("looking for events", 4.0, 11.5)
+    search.progress.begin_stage("looking for events (pushes and wrong samples)", 4.0, 11.5)
     with_events = search
     search, nominal, events, smoothed = _without_events(search, nominal)
     search.record_stage_end_time("events")
@@ -152,7 +152,7 @@ def _examined(
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
-    search.progress.begin_stage(f"screening {len(effects)} candidates", 4.0, ahead)
+    search.progress.begin_stage(f"screening {len(effects)} candidate effects", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
     seen = _Examined(replace(search, problem=composed), *found)
     try:
@@ -183,7 +183,7 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) ->
 
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
-    search.progress.begin_stage(f"{why}: continuing with steps of {h:g} s")
+    search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
     search = search.restarted_with(search.problem.with_time_step(h), search.store)
     return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
 
@@ -208,7 +208,7 @@ def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examin
     problem = seen.with_events.problem.with_encoder_noise_in_efforts(fit.effects, fit.values)
     if problem is None:
         return None
-    seen.search.progress.begin_stage(f"continuing with more noise beside {hypotheses.join_effect_labels(fit.effects)}")
+    seen.search.progress.begin_stage(f"starting again with noise beside {hypotheses.join_effect_labels(fit.effects)}")
     return _examined_with(seen, problem)
 
 
@@ -235,7 +235,7 @@ def _with_changed_parameters(
     search, fit, released = seen.search, seen.nominal, list[str]()
     while left := earlier.shifted_parameters_with_prior(fit, search.thresholds):
         tried = [*released, left[0]]
-        search.progress.begin_stage(f"trying a change of {' and '.join(tried)}", 1.0, 8.5)
+        search.progress.begin_stage(f"trying a change of {' and '.join(tried)} since the baseline", 1.0, 8.5)
         refitted = refit_with_effects(_without_priors_of(search.problem, tried), (), fit.values)
         if refitted is None:
             break
@@ -296,7 +296,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     refitted = refit_with_effects(problem, fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
-    search.progress.begin_stage("twice the links lower chi2: the error of too few links is subtracted")
+    search.progress.begin_stage("starting again without the error of too few links, because twice the links lower chi2")
     search = search.restarted_with(problem)
     nominal = _fitted_nominal_model(search, refitted.values)
     return _examined(search, nominal, seen.truncated, True, seen.removed + 2 * (fit.cost - refitted.cost))
@@ -331,7 +331,7 @@ def _without_events(
         if not events:
             break
         less = replace(first, problem=problem_corrected_for_events(first.problem, events))
-        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 11.5)
+        search.progress.begin_stage("fitting the nominal model without the events that were found", 3.0, 11.5)
         search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
         nominal, before = _fitted_nominal_model(search, nominal.values, name), events
         # the smoother's result includes the events
@@ -402,7 +402,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
-        search.progress.begin_stage("locating the gap", 3.0, 2.0)
+        search.progress.begin_stage("locating the gap in the model and its sensors", 3.0, 2.0)
         # without events, the smoother already ran on all fitted data
         known = nominal.problem, nominal.unknowns, nominal.evaluation
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)

@@ -64,7 +64,7 @@ class NonparametricLaw:
         """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
         is_over_time = self.depends_on == "time"
         words = "time" if is_over_time else f"its {' and its '.join(t.quantity for t in self.tables)}"
-        end = ", and no function of motion or load predicts it better" * is_over_time
+        end = " It may come from outside the model, because no law of motion or load predicts it better."
         sizes = []
         for table in self.tables:
             low, high = self.visited_range[table.quantity]
@@ -76,7 +76,7 @@ class NonparametricLaw:
         gap = f"error beyond noise{' that the effects leave' * self.has_accepted_effects} on held-out motions"
         closed = f"would remove {100 * self.closure.fraction:.3g} % of the {gap}"
         head = f"A torque at {self.location} that depends on {words}"
-        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque{end}."
+        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque.{end * is_over_time}"
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""
@@ -117,11 +117,11 @@ def find_gap_law(
     the nominal one. `places` are the locations of the gap, the most likely first.
     """
     places = [p for p in dict.fromkeys(places) if allowed_torque_law_quantity_names(problem.system, p)][:_MAX_PLACES]
-    if not places or search.is_skipped_past_deadline("a law"):
+    if not places or search.is_skipped_past_deadline("a torque law"):
         return None
     if (h := last.problem.step.time_step) != problem.step.time_step:
         problem = problem.with_time_step(h)
-    search.progress.begin_stage(f"estimating a law at {' or '.join(places)}", 3.0, 2.5)
+    search.progress.begin_stage(f"estimating a torque law at {' or '.join(places)}", 3.0, 2.5)
     # a torque over time would interpolate the held-out blocks
     left_out = ("time",) if search.problem.is_split_in_blocks else ()
     laws = []

@@ -421,8 +421,8 @@ def refit_with_each_effect(
     def one(entry: EffectsWithStart) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
-        left = "no fit" if fit is None else f"held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
-        parts.count_done(f"refitted with {label}: {left}", table)
+        left = "failed" if fit is None else f"gives held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
+        parts.count_done(f"the refit with {label} {left}", table)
         return fit
 
     together = {effect.label: effect for effects, _ in tried for effect in (*base, *effects)}

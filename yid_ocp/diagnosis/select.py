@@ -240,7 +240,7 @@ def select_effects(
         base, beside = better.effects, join_effect_labels(better.effects)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
-        search.progress.begin_stage(f"explained by {beside}: {closed.text}".rstrip(": "))
+        search.progress.begin_stage(f"accepted so far: {beside} ({closed.text})".removesuffix(" ()"))
         is_full = len(base) >= limits.max_effects
         if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
@@ -310,7 +310,7 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     if without is None:
         return chosen
     if not _is_needed(without, full, limits):
-        search.progress.begin_stage(f"removed {label}: the other effects explain as much")
+        search.progress.begin_stage(f"removed {label}, because the other effects explain as much without it")
         return replace(chosen, fit=without)
     search.progress.begin_stage(f"looking for effects in place of {label}", 3.0, 13.0)
     company = f"in place of {label}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_val
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text, p_value_text
 from yid_ocp.effects import EffectBase
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
+MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_CHANGES = 5  # number of named parameters, the largest changes first
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
@@ -44,17 +47,20 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
             (rivals, f"Record a motion in which {aspects[0]}{at} varies over a wider range."),
         )
         if told := [text for several, text in advice if len(several) > 1]:
-            return f"{told[0]} It can separate {abbreviated_names_text([effect.label for effect in rivals])}."
+            return f"{told[0]} This can separate these effects: {', '.join([effect.label for effect in rivals])}."
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
-    mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " moves most.")
+    mostly = _listed(
+        "Record slow and fast motions, with pauses, in which ", place, " (the place of the gap) moves most."
+    )
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
-        "unknown": mostly or "Record faster and larger motions of all joints.",
+        "unknown": mostly or "Record faster and larger motions of all joints, which show more effects.",
         "no_gap": "None is needed for motions like these. Other motions may still show a gap.",
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
-        "effect": "Record and diagnose other motions. If the cause is right, its estimates stay the same.",
+        "effect": "Record and diagnose other motions. If the named cause is right, its estimates stay the same.",
     }
-    return texts[result.verdict]
+    repeat = "None yet. First repeat the diagnosis with the effect that is significant at several locations."
+    return repeat if _several_places(result) else texts[result.verdict]
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
@@ -62,15 +68,15 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.0f} s. Not tested: "
     text = [_gap(result), _listed(stopped, result.untried, ". To test them, raise diagnosis.budget.")]
     if result.verdict not in ("insufficient_data", "no_gap"):
-        (error, change), found = _remains(result), [_places(result), *_causes(result)]
+        (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
     text += [] if result.law is None else [result.law.sentence]
     text += [*map(held_out_truncation_message, result.truncated_recordings), *_bound_by_priors(result)]
     text += _earlier_runs(result)
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    links = "Too few links cause an error, which the diagnosis subtracted. For other commands, double `links` in model."
-    blocks = "Every second block of time is held out, because no recording could be held out."
+    links = "The diagnosis subtracted the error from too few links. For other commands, double `links` in model.object."
+    blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     text += [f"{step} (set problem.time_step: {used} for other commands)." * (stated != used)]
     text += [links * result.is_corrected_for_links, blocks * result.is_split_in_blocks]
     kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
@@ -84,14 +90,16 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = f"only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s are used; then its simulation fails"
-    return f"Of held-out recording '{cut.recording}' {used}. To use more, set a smaller problem.time_step."
+    used = (
+        f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}'"
+    )
+    return f"{used} are used, because its simulation then fails. To use more, halve problem.time_step."
 
 
 def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
     """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     why = f"then moves faster than diagnosis.max_joint_speed ({result.thresholds.max_joint_speed:g} rad/s or m/s)."
-    cut, cuts = "s are ignored, because", result.events.overspeeds
+    cut, cuts = "s are ignored, because joint", result.events.overspeeds
     return [f"Data of '{e.recording}' after {e.start_time:.3g} {cut} {e.joint} {why}" for e in cuts]
 
 
@@ -120,7 +128,7 @@ def _gap(result: DiagnosisResult) -> str:
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
         return f"The nominal model has an error beyond noise (a gap){only}: {sizes} (p {p_text})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"But the error has the pattern of {best.effect.label} (p {p_value_text(p_value, '= ')})"
+    small = f"But the error has the pattern of the effect {best.effect.label} (p {p_value_text(p_value, '= ')})"
     return f"In total the error of the nominal model is within noise: {sizes}. {small}."
 
 
@@ -140,17 +148,17 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     return [small * is_significant, narrow * (along < level), blind]
 
 
-def _places(result: DiagnosisResult) -> str:
-    """Sentence on the gap's locations, with inseparable locations together."""
-    where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= 0.005]
+def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
+    """Return a sentence on the gap's locations, with inseparable ones together, and if `has_origin` on its origin."""
+    where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= MIN_GAP_SHARE]
     parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
     if not parts:
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
-    parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= 0.005 else []
+    parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= MIN_GAP_SHARE else []
     named = ", ".join(f"{100 * part:.0f} % comes from {place}" for part, place in parts)
     origin = result.smoother_result.plant_or_sensor_origin
-    side = f"; its origin is {GAP_ORIGIN_TEXTS[origin]}" if origin in ("plant", "sensor", "either") else ""
+    side = f"; its origin is {GAP_ORIGIN_TEXTS[origin]}" * (has_origin and origin in ("plant", "sensor", "either"))
     return f"Of the error beyond noise that can be located, {named}{side}."
 
 
@@ -172,7 +180,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
     apart = ". ".join(entry.disagreement_text for entry in result.failed_transfer_checks[:2])
-    either = f"Either {names} changed between the recordings, so diagnose them separately, or another cause acts"
+    either = f"If {names} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none = "No cause is named, because"
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
@@ -188,15 +196,18 @@ def _several_places(result: DiagnosisResult) -> str:
     scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
     best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
-    places = abbreviated_names_text([s.effect.location for s in alike])
-    said = f"{''.join(best)} is significant (corrected p below {level:g}) at each of these locations: {places}."
-    advice = "Add it there under model.effects; for friction of joints, run `yid-ocp friction`."
-    return f"{said} {advice}" if result.unknown_reason and len(alike) > 1 else ""
+    if not result.unknown_reason or len(alike) < 2:
+        return ""
+    said = f"{''.join(best)} is significant at several locations (p below {level / len(scores):.2g}): "
+    advice = "Add it there under model.effects, and repeat `yid-ocp diagnose`"
+    if {*best} & {"joint_viscous", *chain.from_iterable(EFFECT_KINDS_BY_FRICTION_LAW.values())}:
+        advice = "Run `yid-ocp friction`, set model.friction as it advises, and repeat `yid-ocp diagnose`"
+    return f"{said}{abbreviated_names_text([s.effect.location for s in alike])}. {advice}."
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
-    text, remedy = [], "To determine the effect, measure one of these parameters and fix it (`free: false`)."
+    text, remedy = [], "To determine the effect, measure these parameters and fix them (parameters.NAME.free: false)."
     for fit in result.single_effect_models:
         if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
             continue
@@ -231,10 +242,11 @@ def _remains(result: DiagnosisResult) -> list[str]:
     worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in beyond}
     mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
     effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
-    who = f"On held-out motions, the error of the {f'model with {effects}' if effects else 'nominal model'} is"
-    said = "no larger than noise and the uncertainty of the parameters explain"
+    who = f"the {f'model with {effects}' if effects else 'nominal model'}"
+    said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}."
     if result.remaining_test.p_value < result.thresholds.significance_level:
-        said = f"{', '.join(worst.values())} (rms, noise subtracted){mostly}"
+        size = f"{', '.join(worst.values())} (rms, noise subtracted)"
+        said = f"On held-out motions, the error of {who} is {size}{mostly}."
     changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
@@ -242,7 +254,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
     change = _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
-    return [f"{who} {said}.", change]
+    return [said, change]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:
@@ -265,7 +277,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         p = since.between_runs_p_value
         differ = f"Runs of the baseline differ by more than their uncertainty (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-        text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
+        text += [f"{differ} The ± of the baseline includes this difference." * (p < _RUNS_DIFFER_LEVEL)]
         text += [small * (not since.is_baseline_explained)]
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():

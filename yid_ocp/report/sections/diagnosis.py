@@ -69,11 +69,13 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             values["noise alone"] = (factor * floor[channel], None)
         rows.append((channel, shown, values))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = ["The figure has the errors on held-out recordings by channel, with the error from noise alone."]
+    sentences = [
+        "The figure shows the rms error of each channel on held-out recordings, and the part from noise alone."
+    ]
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
-        change = f"goes from {first:.3g} to {last:.3g} (1 = noise alone)"
+        change = f"goes from {first:.3g} to {last:.3g} (noise alone gives 1)"
         sentences.append(f"With {names}, chi² per degree of freedom {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
@@ -81,10 +83,10 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             worse = f"; that of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
-        level = f"chi² per degree of freedom is {first:.3g} (1 = noise alone)"
-        sentences.append(f"No effect is accepted, so the figure has the nominal model alone; {level}.")
+        level = f"Its chi² per degree of freedom is {first:.3g} (noise alone gives 1)"
+        sentences.append(f"No effect is accepted as cause, so the figure has the nominal model alone. {level}.")
         tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
-        sentences.append(f"The table above has the errors with {tried}, which was not accepted." if tried else "")
+        sentences.append(f"The table above also has the errors with {tried}, not accepted as cause." if tried else "")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -98,27 +100,26 @@ def _figures_by_model(
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.sentences import GAP_ORIGIN_TEXTS  # other commands need none of it
+    from yid_ocp.diagnosis.sentences import GAP_ORIGIN_TEXTS, MIN_GAP_SHARE, gap_locations_sentence
 
     smoothed = finding.smoother_result
     if smoothed is None:
         return None
-    noticed = ", ".join(place.location for place in finding.gap_locations if place.is_observable)
+    noticed = ", ".join(p.location for p in finding.gap_locations if p.is_observable and p.gap_share < MIN_GAP_SHARE)
     silent = ", ".join(place.location for place in finding.gap_locations if not place.is_observable)
     evidence, origin = smoothed.log_evidence, GAP_ORIGIN_TEXTS[smoothed.plant_or_sensor_origin]
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
-    without = " (without the effects that explain the gap)" if finding.accepted_effects else ""
     sentences = [
-        f"The analysis gives every coordinate of the {_NOMINAL_LABEL}{without} an unknown force, every grasp an "
-        "unknown offset and every measured point an unknown bias, which may change over time. It keeps the fewest "
-        "groups of them that explain the residual.",
-        f"Most probably the origin of the gap is {origin}. The log evidence rises by "
-        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
-        f"alone, by {evidence['both']:.4g} with both; a rise of 5 means odds of 150 to 1. These unknowns explain "
-        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings.",
-        f"A gap at {noticed} would have been detected." if noticed else "",
-        f"A gap at {silent} would not have been detected by these motions and sensors." if silent else "",
-        f"The residual gap lies in {', '.join(left)}." if finding.accepted_effects and left else "",
+        f"Most probably the gap of the {_NOMINAL_LABEL} comes from {origin}.",
+        gap_locations_sentence(finding),
+        f"There is no gap at {noticed}: it would have been detected there." if noticed else "",
+        f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
+        f"The effects leave a gap, mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
+        "To find this, the analysis adds unknowns that may change over time: forces and offsets of grasps (mechanics), "
+        "and biases of measured points (sensors). It keeps the fewest that explain the residual. These explain "
+        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
+        f"{evidence['plant']:.4g} with forces and offsets alone, by {evidence['sensor']:.4g} with biases alone, and by "
+        f"{evidence['both']:.4g} with both. A rise of 5 means odds of 150 to 1.",
     ]
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
@@ -129,11 +130,11 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         maps.append((f"Recording {trace.recording}, {_NOMINAL_LABEL}", figure))
         sentences += [sentence] if i == 0 else []
     if maps:
-        sentences.append("Red is a force, offset or bias in the positive direction, blue in the negative one.")
+        sentences.append("Each map has one kept unknown in each row, over time. Red is positive, blue is negative.")
     else:
-        sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
+        sentences.append("No unknown explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
-        sentences.append(f"{len(smoothed.smoothed_unknowns) - _MAX_MAPS} more recordings are in trajectories.h5.")
+        sentences.append(f"The file trajectories.h5 has all {len(smoothed.smoothed_unknowns)} recordings.")
     return "Where and when the gap arises", sentences, maps
 
 
@@ -153,15 +154,15 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
-        span = f"{edges[j]:.2f} to {edges[j + 1]:.2f} s, {said(j, k)}"
-        sentence = f"Grey cells are not determined. The most significant value is that of {names[k]}, {span}."
+        span = f"{names[k]} from {edges[j]:.2f} to {edges[j + 1]:.2f} s of {trace.recording}, which is {said(j, k)}"
+        sentence = f"Grey cells are not determined. The most significant value is that of {span}."
     else:
         prior = np.sqrt([smoothed.group_variance[source] for source in groups])
         values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
         axis = "value in standard deviations of its prior"
         sentence = (
-            "The data reduce the variance of no single value by more than half, so values are shown in units of the "
-            "standard deviation of their prior. The picture is only a hint."
+            "The recordings determine no single value (none has less than half of its prior variance), so colours show "
+            "values in standard deviations of the prior. The map is only a hint."
         )
     rows = []
     for k in kept:
@@ -180,9 +181,9 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     if not events:
         return None
     sentences = [
-        "Points are the force or torque beyond the model, estimated from the recording. The grey band is the error "
-        "that a correct model has. Shaded windows are events, with their shape as a line. Events are left out of the "
-        "results below where possible."
+        "Points show, over time, the force or torque that the model lacks, as estimated from the recording. The points "
+        "of a correct model lie between the grey lines. Shaded windows are events, with their shape as a line. The "
+        "results below are without events where possible."
         if events.force_estimates
         else "",
         *overspeed_truncation_messages(finding),
@@ -225,10 +226,10 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         return None
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     unit = "as a fraction of the error beyond noise" if percent else absolute
-    promise = f"the predicted decrease of the misfit on fitted motions by each effect (linear model), {unit}."
+    promise = f"the decrease of the misfit on fitted motions that a linear model predicts for each effect, {unit}."
     refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
     why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
-    unmeasured = f"Refitted: {refitted}. Held-out motions do not show how much of the gap this closes{why}."
+    unmeasured = f"Refitted: {refitted}. Held-out motions cannot show how much of the gap these effects close{why}."
     sentences = [
         f"Bars show {promise}",
         unmeasured if refitted else "No predicted decrease is large enough for a refit.",
@@ -238,7 +239,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
             "The left part shows how much of the held-out gap each effect alone closes, refitted with the parameters, "
-            f"with 95 % intervals. At 100 % no gap is left; below zero predictions get worse. The values are {said}.",
+            f"with 95 % intervals. At 100 % no gap is left. Below 0 % predictions get worse. The best are {said}.",
             f"The right part shows {promise}",
         ]
     # room for one word on a narrow screen
@@ -263,10 +264,13 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     rival = law.runner_up
     sentences = [
         law.sentence,
-        "The band is two standard deviations. Dotted lines bound the range that the recordings cover; beyond it the "
-        "torque is held constant. The dashed line is the nearest law of the library.",
-        f"The next best law, {rival[1]} at {rival[0]}, closes {100 * rival[2]:.3g} % of the gap." if rival else "",
-        "law.csv has this table. To use it in a model, add the effect {kind: law, location, depends_on, law_csv}.",
+        "The band is two standard deviations. Dotted lines bound the range that the recordings cover. The law is "
+        "constant beyond the ends of the curve."
+        + " The dashed line is the nearest spring or friction law."
+        * bool({"angle", "speed"} & {*law.visited_range}),
+        f"The next best law, of {rival[1]} at {rival[0]}, removes {100 * rival[2]:.3g} %." if rival else "",
+        "The file law.csv has this law. To use it in a model, add this under model.effects: "
+        f"{{kind: law, location: {law.location}, depends_on: {law.depends_on}, law_csv: law.csv}}.",
     ]
     return "A torque law for the gap", sentences, shown
 
@@ -304,9 +308,9 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     none = f"No two signatures are similar in both directions; by the smaller percentage the closest are {said[0][1]}."
     sentences = [
-        "A cell has the percentage of the row's signature that the column's effect can reproduce, with the parameters. "
-        "At 100 %, these motions and sensors cannot distinguish the two effects.",
-        f"Similar in both directions are (smaller percentage): {listed}." if close else none,
+        "A cell has the percentage of the row's signature (its influence on all predictions) that the column's effect "
+        "and changed parameters can reproduce. At 100 %, these recordings cannot distinguish the two effects.",
+        f"These pairs are similar in both directions, with the smaller percentage: {listed}." if close else none,
     ]
     return "Which effects are confusable", sentences, [("", figures.confusability_matrix_figure(names, values))]
 
@@ -344,9 +348,9 @@ def _curves(
     shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     sentences = [
-        f"The figures show the {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}. Below each is "
-        "the error, with two standard deviations of the sensor noise shaded. A correct model is inside 95 % of the "
-        "time, unless errors of the torques also move the arm."
+        f"Of {count} held-out coordinates or joints, the figures show the {min(count, _MAX_CHANNELS)} that {what}. "
+        "Below each is the error, with two standard deviations of the sensor noise shaded. The error of a correct "
+        "model is inside for 95 % of the time, unless errors of the torques also move the arm."
     ]
     return "Measured and predicted", sentences, shown
 
@@ -365,8 +369,8 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
-        "Without the effects, free parameters change to imitate them. The figure shows this change. Bars are two "
-        "standard deviations, cut at the edge of the figure.",
+        "In a fit without the effects, free parameters change to imitate them. The figure shows this change. Bars are "
+        "two standard deviations, cut at the edge of the figure.",
         f"{said}." if said else "No parameter changes by more than 10 %.",
     ]
     return "Parameters that imitated the effects", sentences, shown
