@@ -68,7 +68,7 @@ def test_a_method_that_stops_early_is_said_to_differ(problem):
     assert found.reference_method == "gauss_newton"
     assert not found.is_consistent
     assert any("iteration_limit" in sentence for sentence in found.disagreements["steepest_descent"])
-    assert "does not find it: the method ended too early (iteration_limit)" in found.explanations[-1]
+    assert "does not find this, because the method ended too early (iteration_limit)" in found.explanations[-1]
 
 
 def test_nothing_to_agree_on(repository, carried_out):
@@ -203,9 +203,9 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
 @pytest.mark.parametrize(
     ("status", "cost", "why"),
     [
-        (LIMIT, 1.0, "it ended with 'iteration_limit' before reaching the optimum"),
-        (Status.STALLED, 99.0, "it ended with 'stalled' before reaching the optimum"),
-        (CONVERGED, 3.1, "it stopped in another local minimum"),
+        (LIMIT, 1.0, "it ended as iteration_limit before it reached the minimum"),
+        (Status.STALLED, 99.0, "it ended as stalled before it reached the minimum"),
+        (CONVERGED, 3.1, "it stopped in another local minimum, whose cost is higher"),
         (CONVERGED, 3.0, "its cost weights the measurements differently"),
     ],
 )
@@ -214,20 +214,26 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
     other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
     found = compared({"c": 11.25}, one=best, two=other)
-    said = f"from one (values in brackets) in a.b 12.35 (10) N m/rad, e 3 (2) N m/rad, because {why}"  # no ±
+    values = "a.b = 12.35 N m/rad (not 10), e = 3 N m/rad (not 2)"
+    said = f"gives other values than one, because {why}: {values}"  # no ±
     assert found.disagreements == {"one": [], "two": [said]}
     weak, lost = found.explanations
-    assert all(fact in weak for fact in ("c (truth 11.25)", "weakly", "one 5, two 99")), weak
-    assert lost.startswith("d cannot be found: ")
+    assert all(fact in weak for fact in ("c (truth 11.25)", "weakly", "5 (one), 99 (two)")), weak
+    assert lost.startswith("d cannot be found. ")
 
 
 @pytest.mark.parametrize(
     ("a", "b", "status", "said"),
     [
         (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth for all parameters"]),
-        (10.0, 3.0, Status.STALLED, ["b (– for 2, cannot be found); these are exactly the parameters that are not"]),
-        (8.9, 3.0, LIMIT, ["a (8.9 for 10, found), b (– for 2,", "find it: the method ended too early (it"]),
-        (11.1, 2.0, CONVERGED, ["a, but steepest_descent does not find it: its cost", "b (cannot be found) ended"]),
+        (10.0, 3.0, Status.STALLED, ["b (–, true 2, cannot be found). These are exactly the parameters that are"]),
+        (8.9, 3.0, LIMIT, ["a (8.9, true 10, found), b (–, true 2,", "because the method ended too early (it"]),
+        (
+            11.1,
+            2.0,
+            CONVERGED,
+            ["a, but steepest_descent does not find this, because its", "b (cannot be found) ended"],
+        ),
     ],
 )
 def test_where_the_papers_method_ended_far_from_the_truth(compared, a, b, status, said):
@@ -274,8 +280,8 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     # what cannot weigh this noise has no verdict of its own
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
-    assert found.disagreements["single_shooting"][0].startswith("from steepest_descent (values in brackets) in a 7.5")
-    told = "a (7 for 10, in doubt); the recordings determine a, but steepest_descent does not find it: it ignores noise"
+    assert found.disagreements["single_shooting"][0].startswith("gives other values than steepest_descent, because ")
+    told = "a (7, true 10, in doubt). The recordings determine a, but steepest_descent does not find this, because it"
     assert told in found.explanations[-1]
 
 
@@ -431,14 +437,14 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
-    assert f"memory is {'' if kept else 'not '}kept" in safe.message
-    assert f"{with_it:.3g} with memory and {without:.3g} without" in safe.message
+    assert f"The estimates {'have' if kept else 'are without'} the cable's shape memory" in safe.message
+    assert f"{with_it:.3g} with the memory and {without:.3g} without" in safe.message
 
 
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert "inf with memory and" in choose_fit_with_or_without_shape_memory(problem, None, found).message
+    assert "inf with the memory and" in choose_fit_with_or_without_shape_memory(problem, None, found).message
     solved.ok = False
     assert choose_fit_with_or_without_shape_memory(problem, None, found).solution is found
 
@@ -549,4 +555,4 @@ def test_the_error_of_links_is_uncounted_where_an_object_has_them_and_nothing_is
     found, checks = estimation.add_discretisation_errors(made, fit, None)
     assert found.parameters == fit.parameters
     assert checks.notes == ("why",)
-    assert checks.uncounted_errors == (("of the object's links",) if links else ()) + ("of the time step",)
+    assert checks.uncounted_errors == (("from the number of links",) if links else ()) + ("from the time step",)

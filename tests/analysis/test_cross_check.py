@@ -52,7 +52,7 @@ def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith(
-        "the built model: mass matrix, weight and inverse dynamics agree with Pinocchio's within "
+        "the built model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio to within "
     )
 
 
@@ -71,7 +71,7 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
 
 
 def test_differences_and_files_that_pinocchio_does_not_read_are_said(tmp_path, urdf_folder):
-    said = "it differs from Pinocchio's: weight by 2 % of the largest entry (1e-06 % is tolerated); find the cause"
+    said = "it differs from Pinocchio's: weight by 2 % of the largest entry (1e-06 % is tolerated). Find the cause"
     system = branched(urdf_folder)
     same = compare_system_with_pinocchio(system, system.parameters.vector(), np.zeros(system.n_coordinates))
     heavier, unknown = (replace(same, of="it", weight=error) for error in (0.02, float("nan")))

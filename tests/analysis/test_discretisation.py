@@ -369,9 +369,9 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got_without_prescribed_coordi
 @pytest.mark.parametrize(("decades", "stable"), [(0.0, True), (6.0, True), (6.1, False)])
 def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
-    told = "too long for the motion of run; set problem.time_step: 0.0025 or less. The simulation is unstable: a "
-    told += "numerical error grows by 29 % per step at 0.35 s, in total to 10^6.1 times its size (10^6 is tolerated)"
-    told = f"the time step of 0.005 s is {'stable along the motion of run' if stable else told}"
+    told = "too long for the motion of 'run': the simulation is unstable. Set problem.time_step: 0.0025 or less. Small "
+    told += "errors grow by 29 % per step (at 0.35 s), and in total to 10^6.1 times their size (10^6 is tolerated)"
+    told = f"the time step of 0.005 s is {'stable along the motion of ' + repr('run') if stable else told}"
     assert (said.keeps_errors_below_resolution, said.stability_message) == (stable, told)
 
 

@@ -74,7 +74,7 @@ def test_python_and_shell_say_the_same(coarse):
     options = replace(problem.options, divided_links_model=None, checked_discretisations=("links",))
     bare = yid.solve(problem.with_options(options))
     assert bare.std == bare.checks.data_std
-    assert "± without the error of the object's links and of the time step" in repr(bare)
+    assert "± without the error from the number of links and from the time step" in repr(bare)
 
 
 @pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])

@@ -149,7 +149,7 @@ def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuis
     monkeypatch.setattr(module, "with_free_starts_and_grasps", lambda *_: wide)
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
     assert hidden.verdict == "not_identifiable"
-    assert hidden.words.startswith(f"the recordings cannot distinguish a change of a from {words}; ")
+    assert hidden.words.startswith(f"these recordings cannot distinguish a change of a from {words}. ")
 
 
 def test_a_combination_that_a_nuisance_hides_is_said_so():
@@ -159,7 +159,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     both = "a relative change of a and b in the ratio 1 : 1"
-    assert said.startswith(f"the recordings cannot distinguish {both} from another initial state; begin recordings")
+    assert said.startswith(f"these recordings cannot distinguish {both} from another initial state. Begin recordings")
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):

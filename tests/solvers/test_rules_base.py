@@ -225,7 +225,7 @@ def test_weights_are_renewed_after_every_step_and_gains_kept_after_short_ones():
     problem = Disturbed(linear(np.eye(1), [-2.5]))
     told = []
     solution = fit_problem(problem, solver, callback=told.append, restarts=False)
-    assert [entry.note for entry in told] == ["", "", *(f"weights {k} of at most 16" for k in (2, 3, 4))]
+    assert [entry.note for entry in told] == ["", "", *(f"weighting {k} of at most 16" for k in (2, 3, 4))]
     assert starts(solver) == [[1.0]]
     assert [at[0] for at, _ in problem.frozen] == pytest.approx([1.0, 1.0, 2.0, 2.5])
     assert [kept for _, kept in problem.frozen] == [False, False, False, True]
@@ -289,7 +289,7 @@ def test_a_long_step_that_raises_the_cost_is_left_to_the_solver():
 
 def test_a_search_can_be_stopped_between_weights():
     def stop(entry):
-        if entry.note.startswith("weights 3"):
+        if entry.note.startswith("weighting 3"):
             raise base.StopSearch("enough")
 
     solution = fit_problem(Disturbed(linear(np.eye(1), [-9.5])), Carrying([[1.0]]), callback=stop)
@@ -377,7 +377,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     assert (solution.x.tolist(), solution.goodness_of_fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
     notes = {entry.note for entry in solution.history}
-    assert notes == {"", "weights 2 of at most 16", "start 2 of at most 3: best fit x 1.25"}
+    assert notes == {"", "weighting 2 of at most 16", "start 2 of at most 3: best fit x 1.25"}
     poor = Carrying(there, [[2.5], [2.1]], [[3.2], [2.2]])
     solution = fit_problem(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message
@@ -392,7 +392,7 @@ def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     assert len(solver.runs) == 1
     assert problem.frozen == []
     assert solution.problem is problem
-    assert ("ignore noise of the torques" in solution.message, solution.message[:7]) == (True, "run 1; ")
+    assert ("ignore noise of the torques" in solution.message, solution.message[:7]) == (True, "run 1. ")
 
 
 def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_in_place_of_a_prediction():
@@ -627,7 +627,7 @@ def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
     found = fit_problem(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
     assert found.status == Status.CONVERGED
     assert found.n_iterations == 20
-    assert "moved nothing by a tenth of its standard deviation" in found.message
+    assert "moved no unknown by more than a tenth of its standard deviation" in found.message
 
 
 @pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])

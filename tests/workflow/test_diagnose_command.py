@@ -83,7 +83,7 @@ def test_an_interrupted_diagnosis_resumes_its_finished_refits(rubbing, whole, tm
         run_diagnose(run, tmp_path / "run", Interrupting(after=1))
     done, counted.count = counted.count, 0
     assert 0 < done <= once
-    assert "the same command reuses them" in caplog.text
+    assert "The same command reuses them" in caplog.text
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("run")] == ["run.partial"]
     again = run_diagnose(run, tmp_path / "run")
     assert counted.count == once - done

@@ -129,21 +129,21 @@ def compare_methods(
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
     if not run.has_values:
-        return ["in that it was stopped before its first iteration and has no values; raise compare.total_time_budget"]
+        return ["was stopped before its first iteration and has no values. Raise compare.total_time_budget"]
     values = []
     for name in (name for name, entry in judged.items() if entry.verdict == "identifiable"):
         entry, reference = run.solution.parameters[name], best.solution.parameters[name]
         # a fit that stopped early has a large ± from its misfit, which would agree with everything
         std = max(entry.std, reference.std) if run.solution.status == Status.CONVERGED else reference.std
         if abs(entry.value - reference.value) > max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
-            values.append(f"{name} {entry.value:.4g} ({reference.value:.4g}) {entry.unit}")
+            values.append(f"{name} = {entry.value:.4g} {entry.unit} (not {reference.value:.4g})")
     if run.solution.status != Status.CONVERGED:
-        why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
+        why = f"it ended as {run.solution.status.value} before it reached the minimum"
     elif run.whitened_cost > best.whitened_cost + 2.0:
-        why = "it stopped in another local minimum"
+        why = "it stopped in another local minimum, whose cost is higher"
     else:
         why = "its cost weights the measurements differently"
-    return [f"from {best.method} (values in brackets) in {', '.join(values)}, because {why}"] if values else []
+    return [f"gives other values than {best.method}, because {why}: {', '.join(values)}"] if values else []
 
 
 def _explanations(
@@ -152,10 +152,10 @@ def _explanations(
     runs, sentences = [run for run in runs if run.has_values], []
     for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
         known = f" (truth {truth[name]:g})" if name in truth else ""
-        places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
+        places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
-        ends = "the data do not determine it, so no value is shown" if is_lost else f"the methods end at {places}"
-        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}: {ends}")
+        ends = "The recordings do not determine it, so no value is shown" if is_lost else f"Its values are {places}"
+        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}. {ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, judged, truth, disturbed) for run in descents]
 
@@ -174,18 +174,18 @@ def _descent_errors(
     if not wrong:
         return f"{run.method} ended {within} for all parameters"
     shown = {name: value_and_uncertainty_text(own[name].value, None, verdict=known[name].verdict) for name in wrong}
-    places = ", ".join(f"{name} ({shown[name]} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
+    places = ", ".join(f"{name} ({shown[name]}, true {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
     text = f"{run.method} did not end {within} for {places}"
     if wrong == hidden:
-        return f"{text}; these are exactly the parameters that are not found"
+        return f"{text}. These are exactly the parameters that are not found"
     seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
     if seen:
         why = "it ignores noise of the torques" if disturbed else "its cost weights the measurements differently"
         if run.solution.status != Status.CONVERGED:
             why = f"the method ended too early ({run.solution.status.value})"
-        text += f"; the recordings determine {', '.join(seen)}, but {run.method} does not find it: {why}"
+        text += f". The recordings determine {', '.join(seen)}, but {run.method} does not find this, because {why}"
     if lucky:
-        text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} ended near the truth nevertheless"
+        text += f". Nevertheless {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} ended near the truth"
     return text
 
 

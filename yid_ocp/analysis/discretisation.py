@@ -116,7 +116,7 @@ def _gauss_newton_step_in_finer_model(
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
     if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
-        return "the finer model uses other samples of the recordings, so the two cannot be compared"
+        return "the finer model would use other samples of the recordings"
     is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
@@ -330,16 +330,16 @@ def parameter_shifts_at_finer_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            remedy = f"To find it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates"
-            usable = "Estimates stay usable, but their ± leaves this error out"
-            notes.append(f"whether {words} would change the estimates is unknown, because {own}. {usable}. {remedy}")
+            remedy = f"To see it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates."
+            usable = "The estimates may be used, but their ± leaves this error out."
+            notes.append(f"Whether {words} would change the estimates is unknown: {own}. {usable} {remedy}")
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:
-                said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise"
-                notes.append(f"{said}, so first {_REFINED_SETTINGS[key]} and run `solve` again")
+                said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
+                notes.append(f"{said}. First {_REFINED_SETTINGS[key]}, and run `solve` again.")
     if kinds and not model_difference_only and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()
@@ -478,13 +478,13 @@ class AlternatingErrorGrowth:
     @property
     def stability_message(self) -> str:
         """A sentence that states whether the time step is stable, with a remedy if it is not."""
-        step, motion = f"the time step of {self.time_step:g} s is", f"the motion of {self.recording_name}"
+        step, motion = f"the time step of {self.time_step:g} s is", f"the motion of '{self.recording_name}'"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along {motion}"
-        grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % per step at {self.max_growth_time:.3g} s, in total"
-        total = f"to 10^{self.growth_decades:.2g} times its size (10^{_MAX_GROWTH_DECADES:g} is tolerated)"
-        remedy = f"set problem.time_step: {self.time_step / 2:g} or less"
-        return f"{step} too long for {motion}; {remedy}. The simulation is unstable: a numerical error {grows} {total}"
+        grows = f"by {100 * (self.max_step_factor - 1):.2g} % per step (at {self.max_growth_time:.3g} s), and in total"
+        total = f"to 10^{self.growth_decades:.2g} times their size (10^{_MAX_GROWTH_DECADES:g} is tolerated)"
+        remedy = f"Set problem.time_step: {self.time_step / 2:g} or less"
+        return f"{step} too long for {motion}: the simulation is unstable. {remedy}. Small errors grow {grows} {total}"
 
 
 def _error_growth_along(

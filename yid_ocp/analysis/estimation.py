@@ -32,7 +32,7 @@ from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import IterationCallback, Solver
 
-UNCOUNTED_ERROR_TEXTS = {"links": "of the object's links", "time_step": "of the time step"}
+UNCOUNTED_ERROR_TEXTS = {"links": "from the number of links", "time_step": "from the time step"}
 
 
 def solve(
@@ -154,10 +154,10 @@ def _checked_solution_and_step_stability(
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
-        message = f"at the estimate {end.stability_message} ({solution.message})"
+        message = f"at the estimate {end.stability_message}. Solver: {solution.message}"
         return replace(solution, status=status, message=message), found
     if solution.status == Status.FAILED and begin is not None and not begin.keeps_errors_below_resolution:
-        return replace(solution, message=f"at the start {begin.stability_message} ({solution.message})"), found
+        return replace(solution, message=f"at the start {begin.stability_message}. Solver: {solution.message}"), found
     return solution, found
 
 
@@ -203,15 +203,15 @@ def choose_fit_with_or_without_shape_memory(
     if other.evaluation is None:
         return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = "the cable's shape memory is not kept, because a test of it needs two recordings that start in motion "
-        words += "and there is only one; add one under recordings.estimate"
+        words = "The estimates are without the cable's shape memory, because a test of the memory needs two recordings "
+        words += "that start in motion, and there is only one. For this test, add one under recordings.estimate."
         return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    told = "recordings that start in motion, each predicted from the others, have an rms error of"
-    errors = f"{told} {kept:.3g} with memory and {dropped:.3g} without (in standard deviations of the noise)"
+    told = "Recordings that start in motion, each predicted from the others, have an rms error of"
+    errors = f"{told} {kept:.3g} with the memory and {dropped:.3g} without (in standard deviations of the noise)."
     if kept < dropped:
-        return FitWithOrWithoutShapeMemory(problem, solution, f"the cable's shape memory is kept: {errors}")
-    return FitWithOrWithoutShapeMemory(without, other, f"the cable's shape memory is not kept: {errors}")
+        return FitWithOrWithoutShapeMemory(problem, solution, f"The estimates have the cable's shape memory. {errors}")
+    return FitWithOrWithoutShapeMemory(without, other, f"The estimates are without the cable's shape memory. {errors}")
 
 
 def problem_without_shape_memory(problem: EstimationProblem) -> EstimationProblem:
@@ -373,8 +373,8 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
                 unit = units[channels[0]]
-                what = f"the rms error of the model is {error:.3g} {unit}, that of the guess '{best}' without a model "
-                what += f"only {guess:.3g} {unit} (the model's may be {_WORSE_RATIO:g} times as large)"
+                what = f"the rms error of the model is {error:.3g} {unit}, but the guess '{best}' without a model has "
+                what += f"only {guess:.3g} {unit} (the error of the model may be {_WORSE_RATIO:g} times as large)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])

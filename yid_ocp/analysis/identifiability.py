@@ -379,7 +379,7 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
         change = ("a change of " if len(parts) == 1 else "") + _change_words(parts)
-        return f"the recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
+        return f"these recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
     form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
         return _combination_words(parts)
@@ -390,16 +390,16 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    rest = "begin recordings at rest, with problem.initial_state: equilibrium"
+    rest = "Begin recordings at rest, and set problem.initial_state: equilibrium"
     places = {name.partition("@")[2].rpartition(".")[0] for name in others if name.startswith(_GRASP_OFFSET_PREFIX)}
-    grasp = f"measure the position of grasp {', '.join(sorted(places))}: without --unknown-grasp, it counts as known"
-    start = f"another initial state; {rest}", "start."
-    for words, prefix in (start, (f"another position of the grasp; {grasp}", _GRASP_OFFSET_PREFIX)):
+    grasp = f"Measure the position of grasp {', '.join(sorted(places))}, and leave out --unknown-grasp"
+    start = f"another initial state. {rest}", "start."
+    for words, prefix in (start, (f"another position of the grasp. {grasp}", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
         remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
         if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
             return words
-    return f"another initial state and position of the grasp; {rest}, or {grasp}" if places else f"others; {rest}"
+    return f"another initial state and position of the grasp. {rest}. {grasp}" if places else f"other unknowns. {rest}"
 
 
 def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:

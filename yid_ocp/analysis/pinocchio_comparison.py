@@ -50,11 +50,11 @@ class _PinocchioComparison:
         """One sentence, which says that the model agrees with Pinocchio, or what differs and by how much."""
         parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
-            said = f"{self.of}: mass matrix, weight and inverse dynamics agree with Pinocchio's"
-            return f"{said} within {max(parts.values()):.1g} of the largest entry"
+            said = f"{self.of}: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio"
+            return f"{said} to within {max(parts.values()):.1g} of the largest entry"
         wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts.items() if not size <= _RELATIVE_TOLERANCE]
         tolerated = f"of the largest entry ({100 * _RELATIVE_TOLERANCE:g} % is tolerated)"
-        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} {tolerated}; find the cause before you use it"
+        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} {tolerated}. Find the cause before you use it"
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:

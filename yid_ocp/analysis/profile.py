@@ -78,7 +78,7 @@ def compute_profile_likelihood_interval(
     deltas = np.array([point.chi2 for point in points]) - walk.base
     if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
         said = f"a better fit exists (chi2 lower by {-walk.base:.2g}), so the values are not the best ones"
-        walk.notes.append(f"{said}; repeat `yid-ocp solve` with other initial values (parameters.NAME.initial)")
+        walk.notes.append(f"{said}. Repeat `yid-ocp solve` with other initial values (parameters.NAME.initial)")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_val
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text, p_value_text
 from yid_ocp.effects import EffectBase
-from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
@@ -25,6 +23,7 @@ MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_CHANGES = 5  # number of named parameters, the largest changes first
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
+_FRICTION_KINDS = ("joint_viscous", "joint_coulomb", "joint_stribeck", "joint_load_friction", "joint_presliding")
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
     "plant": "the mechanics, not a sensor",
@@ -198,9 +197,9 @@ def _several_places(result: DiagnosisResult) -> str:
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
     if not result.unknown_reason or len(alike) < 2:
         return ""
-    said = f"{''.join(best)} is significant at several locations (p below {level / len(scores):.2g}): "
+    said = f"{best[0]} is significant at several locations (p below {level / len(scores):.2g}): "
     advice = "Add it there under model.effects, and repeat `yid-ocp diagnose`"
-    if {*best} & {"joint_viscous", *chain.from_iterable(EFFECT_KINDS_BY_FRICTION_LAW.values())}:
+    if best[0] in _FRICTION_KINDS:
         advice = "Run `yid-ocp friction`, set model.friction as it advises, and repeat `yid-ocp diagnose`"
     return f"{said}{abbreviated_names_text([s.effect.location for s in alike])}. {advice}."
 

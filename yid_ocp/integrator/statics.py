@@ -153,10 +153,10 @@ class EquilibriumSolver:
             joint = int(np.argmax(np.abs(give)))
             failed = True
             # with a torque, any of the three starts may lead to a wrong equilibrium
-            parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
+            cause = "the grasp" if torque is None else "the measured torques and the grasp"
             limit = f"at most {_MAX_HOLD_DEFLECTION:g} rad is tolerated"
-            far = f"{system.driven[joint]} would come to rest {abs(give[joint]):.3g} rad away ({limit})"
-            message = f"the measured {parts}: {far}. Check its torque, the payload and the grasp"
+            far = f"{abs(give[joint]):.3g} rad away from its measured angle at rest ({limit})"
+            message = f"{cause} would move {system.driven[joint]} {far}. Check its torque, the payload and the grasp"
         # torque and posture enter only as torque + holding stiffness * posture
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
         derivatives, said = (by_theta, by_posture, by_torque), (not failed, error, message)

@@ -66,16 +66,18 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    yield "Refitted candidates come first. Closure alone: part of the held-out error beyond noise that each removes."
-    yield "The others are ordered by score (significance before a refit). p: probability of this score by noise alone."
+    if any(entry["closure"] is not None for entry in result["which"]):
+        yield "Refitted candidates come first. Closure: part of the held-out error beyond noise that one alone removes."
+    yield "Score: significance of a candidate before a refit. p: probability that noise alone gives such a score."
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    yield f"These recordings cannot show the effects {', '.join(result['unseen'])}." if result.get("unseen") else ""
+    unseen = abbreviated_names_text(result.get("unseen", ()), float("inf"))
+    yield f"These recordings would not show the following effects, even if they exist: {unseen}." if unseen else ""
     for signals, kinds in result.get("not_candidates", {}).items():
-        yield f"These effects were not tried, because no recording has {signals}: {', '.join(kinds)}."
+        yield f"These effects were not tried, because no recording has the signal {signals}: {', '.join(kinds)}."
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
-        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
+        moved = "unknown" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     yield SummaryTable(rows, "Since the baseline")
     rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]
@@ -84,11 +86,11 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             sizes = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
-    yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
+    yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
     if any(own["severity"] != "warning" for own in result.get("issues", ())):
         yield "Issues of the recordings may have caused this verdict. Correct the issues, then diagnose again."
     if result["next_plan"] is not None:
-        yield "This command plans a motion that separates the effects which these recordings cannot distinguish:"
+        yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield from copyable_estimates_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
@@ -162,7 +164,9 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
-    seen: TableRows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
+    seen: TableRows = [
+        ("size / detectable", "cases", "gap found", "kind and place first", "alone or in a set of three")
+    ]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
@@ -242,13 +246,13 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
     ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
     said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
-    said += [f"{entry['name']}: {entry['message'].splitlines()[0]}." for entry in runs if not entry["ok"]]
+    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
     if (alike := result["history"]) is not None:
         yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
         said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}: without it the other runs agree much better."] if wrong else []
+        said += [f"Do not trust {', '.join(wrong)}, because the other runs agree much better alone."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -293,10 +297,10 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    yield "The cost compares the methods. chi2 per degree of freedom compares each with noise, which alone gives 1."
-    yield from (f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged")
-    yield from (f"{n} differs {sentence}" for n, entry in methods.items() for sentence in entry["disagreements"])
-    yield from result["explained"]
+    yield "The method with the lowest cost fits best. Noise alone gives a chi2 per degree of freedom of 1."
+    yield from (f"{n} did not converge: {e['message']}." for n, e in methods.items() if e["status"] != "converged")
+    yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
+    yield from (f"{sentence}." for sentence in result["explained"])
     agree = "" if objections else "All methods agree within their uncertainty on the parameters that are found."
     yield SummaryStatement(agree, "conclusion")
 
@@ -307,7 +311,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
-        yield f"Do not use the columns {' and '.join(methods)}, because {words}."
+        yield f"Do not use the columns {', '.join(methods)}, because {words}."
         yield "Use the column `solve`, which includes this noise. The verdicts belong to it."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
@@ -391,7 +395,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}, because without it the other runs agree much better."
+        yield f"Do not trust {' and '.join(wrong)}, because the other runs agree much better alone."
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."

@@ -71,7 +71,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
     yield SummaryTable(rows, "Errors on the fitted recordings")
     yield from _held_out_blocks(result)
-    yield SummaryTable(torque_offset_table_rows(result), "Errors of the torques")
+    yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
     yield from discretisation_shift_sentences(result)
     if failed:
         said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
@@ -83,8 +83,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     yield from copyable_estimates_blocks(result)
     yield result.get("safeguard", "")
-    status = result["status"] + ", so do not use the values" * (result["status"] == "stalled")
-    ended = f"{status}: {result['message']}; {result['iterations']} iterations, {result['seconds']:.1f} s"
+    steps = f"{count_with_noun(result['iterations'], 'iteration')} ({result['seconds']:.1f} s)"
+    steps += ", so do not use the values" * (result["status"] == "stalled")
+    ended = f"{result['status'].replace('_', ' ')} after {steps}: {result['message']}"
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
@@ -121,7 +122,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f" A guess without a model gives {sizes[3]} ({_BASELINE_DESCRIPTIONS.get(best, best)})." if best else ""
+        guess = f" The guess that {_BASELINE_DESCRIPTIONS.get(best, best)} gives {sizes[3]}." if best else ""
         text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
         if noise is None or error is None or fitted is None:
             continue
@@ -155,7 +156,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shared = [name for name in guessed[0] if all(name in each for each in guessed)]
         medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
         errors.append((f"median of {len(own)}", channel, statistics.median(one[2] for one in own), None, medians))
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "without a model")]
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
     for recording, channel, rmse, noise, guesses in errors:
         unit = channel_or_group_unit(units, channel)
         without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
@@ -165,9 +166,9 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
-    yield from (f"Held-out recording '{name}' could not be predicted: {why}." for name, why in failed)
+    yield from (f"The held-out recording '{name}' could not be predicted, because {why}." for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"The column 'without a model' has errors of guesses, for comparison: {legend}." if legend else ""
+    yield f"For comparison, the last column has the rms errors of guesses: {legend}." if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -206,10 +207,10 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
-        said = f"There is nothing to analyse, because the fit ended as {result['status']}: {result['message']}."
+        said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
+    unsure = ("± [of the value]", "± if start and grasps were unknown", "± if all else were known")
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
@@ -223,16 +224,16 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
-    yield from hidden[:_MAX_DIRECTIONS]
-    yield "To find them, record other motions (`yid-ocp plan`) or fix one (parameters.X.free: false)." if hidden else ""
+    yield from (f"{words[:1].upper()}{words[1:]}." for words in hidden[:_MAX_DIRECTIONS])
+    yield "Record other motions (`yid-ocp plan`), or fix some (parameters.NAME.free: false)." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
-    yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
+    yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]")]
-        yield "Gain: information on all parameters. 0.7 nat more halves the standard deviation of one parameter."
+        yield "Gain: more information on all parameters. 0.7 nat halves the standard deviation of one parameter."
         changes = {own["words"]: own for own in (asked["base"], *asked["singles"], *asked["smallest"])}
         for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
@@ -335,7 +336,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
     yield f"The search raised the information of the motion by {gain}. {more}"
     reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"The motion reaches {'; '.join(reached) or 'none of its limits'}."
+    yield f"The motion reaches {', and '.join(reached) or 'none of its limits'}."
     yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
@@ -346,9 +347,9 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     model = result["model"]
-    driven = f"{model['nu']} driven, {model['nc']} prescribed"
+    driven = f"{model['nu']} driven and {model['nc']} prescribed joints"
     size = [count_with_noun(model[key], noun) for key, noun in (("n", "coordinate"), ("m", "constraint"))]
-    yield f"model: {', '.join(size)}, {driven}, {count_with_noun(model['ntheta'], 'parameter')}"
+    yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
     yield from (entry["words"] for entry in result["mechanics"].values() if entry["agrees"])
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
     rests = []
@@ -359,9 +360,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
         rest = entry.get("equilibrium")
         said = [] if rest is None else ["an equilibrium was found" if rest["found"] else rest["message"]]
-        gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
-        said += ["grasps are open by " + ", ".join(gaps)] if gaps else []
-        rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
+        gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
+        said += ["hand and object are apart at grasp " + ", ".join(gaps)] if gaps else []
+        rests.append(f"At the start of '{entry['recording']}', {', and '.join(said)}." if said else "")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
     yield from rests
     convergence = result["convergence"]
@@ -371,7 +372,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         yield SummaryTable(rows, f"Frequencies by {head}")
-    yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
+    yield f"Natural frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
     yield "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)" if moved else ""
     yield from moved
@@ -484,7 +485,7 @@ def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @register_summary("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
-        yield SummaryStatement(f"The simulation failed: {result['message']}", "verdict")
+        yield SummaryStatement(f"The simulation failed: {result['message']}.", "verdict")
     else:
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group", "samples"), *rows], "Recorded", is_key_table=True)

@@ -127,7 +127,7 @@ class Solution(ReprMixin):
         more, chi2 = rest if count else "", self.goodness_of_fit.chi2_per_dof
         fit = f"chi2 per degree of freedom {chi2:.3g}" if math.isfinite(chi2) else self.message
         how = f"{self.status.value.replace('_', ' ')} by {self.solver_name}"
-        left_out = ("of discretisation",) if self.checks is None else self.checks.uncounted_errors
+        left_out = ("from links and time step",) if self.checks is None else self.checks.uncounted_errors
         uncounted = f"± without the error {' and '.join(left_out)}" if left_out and free else ""
         return ReprTexts(", ".join(filter(None, (how, *told, more, fit, uncounted))), rows)
 
@@ -425,12 +425,13 @@ class _MultiStartSearch:
 
     def _status_and_message(self) -> tuple[Status, str]:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
-        status, message = result.status, result.message
+        status, starts = result.status, f" (best of {len(self._fits)} starts)" * (len(self._fits) > 1)
+        message = result.message + starts
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
-            message += "; weights and ± ignore noise of the torques or angles that move the model (use gauss_newton)"
+            message += ". Weights and ± ignore noise of the torques or angles that move the model. Use gauss_newton"
         constant = any(episode.has_biases_treated_as_noise for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
-            message += "; its weights ignore constant errors of sensors and clocks (gauss_newton includes them)"
+            message += ". Its weights ignore constant errors of sensors and clocks. gauss_newton includes them"
         if not finish.ok:
             return Status.FAILED, finish.message
         ended = result.stopped_at_noise_level or linearized_residual.is_stationary_point(
@@ -438,8 +439,8 @@ class _MultiStartSearch:
         )
         if status == Status.CONVERGED and not ended:
             stopped = f"the search stopped where the cost still falls ({message})"
-            return Status.STALLED, f"{stopped}; set a smaller tolerance, other initial values or another solver"
-        return status, message + (f" (best of {len(self._fits)} starts)" if len(self._fits) > 1 else "")
+            return Status.STALLED, f"{stopped}. Set a smaller tolerance, other initial values or another solver"
+        return status, message
 
 
 def _noting(callback: IterationCallback | None, note: str) -> IterationCallback | None:
@@ -535,11 +536,11 @@ class _RelinearizingSearch:
                 return ended(Status.FAILED, now.message)
             (lower, upper), size = problem.bounds, np.maximum(np.abs(x), problem.unknown_scales)
             slope = linearized_residual.max_abs_projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
-            recorder.record_iterate(now.cost, x, slope, f"weights {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
+            recorder.record_iterate(now.cost, x, slope, f"weighting {number + 2} of at most {_MAX_LINEARIZATIONS + 1}")
             step = linearized_residual.size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
             length = linearized_residual.step_norm_in_stds(now, step)
             if length < _LAST_STEP_STDS:
-                return ended(Status.CONVERGED, "a step is less than a hundredth of a standard deviation")
+                return ended(Status.CONVERGED, "the last step is below a hundredth of a standard deviation")
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
             along, whole = now.jacobian @ moved, now.jacobian @ step
             if np.any(along):

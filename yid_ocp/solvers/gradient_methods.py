@@ -101,11 +101,11 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
                     last = f"the last {_PATIENCE_STEPS} steps together lowered the cost by only {saved:.2g}"
-                    message = f"{last} and moved nothing by a tenth of its standard deviation"
+                    message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                message = f"no convergence in {self.max_iterations} iterations; "
-                message += "raise solver.max_iterations or free fewer parameters"
+                message = f"no convergence in {self.max_iterations} iterations. "
+                message += "Raise solver.max_iterations or free fewer parameters"
                 return ended(base.Status.ITERATION_LIMIT, message)
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
@@ -137,8 +137,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
             if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)
-                message = f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
-                message += "set other parameters.NAME.initial, shorten the recording, or use multiple_shooting"
+                message = f"no step lowers the cost ({trial.message or 'the linear model does not hold'}). "
+                message += "Set other parameters.NAME.initial, shorten the recording, or use multiple_shooting"
                 return ended(base.Status.STALLED, message)
 
 
@@ -221,8 +221,8 @@ class SingleShooting(base.SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
-        words = {0: "the cost no longer falls", 1: "no convergence; raise solver.max_iterations"}
-        message = words.get(result.status, f"{str(result.message).lower()}: no minimum was found; use gauss_newton")
+        words = {0: "the cost no longer falls", 1: "no convergence. Raise solver.max_iterations"}
+        message = words.get(result.status, f"no minimum was found ({result.message}). Use gauss_newton")
         return recorder.solver_result_with_iterates(status, message, best.x, warm)
 
 
@@ -290,7 +290,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
-                    return ended(base.Status.STALLED, "no step along the gradient lowers the cost; try gauss_newton")
+                    return ended(base.Status.STALLED, "no step along the gradient lowers the cost. Use gauss_newton")
             moved, before, x = trial - x, gradient, trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
             length /= self.backtracking_factor
@@ -299,5 +299,5 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, size))
-        message = f"no convergence in {self.max_iterations} iterations, as is usual for this method; try gauss_newton"
+        message = f"no convergence in {self.max_iterations} iterations, as is usual for this method. Use gauss_newton"
         return ended(base.Status.ITERATION_LIMIT, message)

@@ -164,13 +164,13 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[base.Status, str]:
-        closed = f"the largest jump between time steps (defect) is {defect:.1e}, and should be near 0"
+        closed = f"The largest jump between time steps (defect) is {defect:.1e}, and should be near 0"
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-            return base.Status.CONVERGED, f"IPOPT found a minimum; {closed}"
+            return base.Status.CONVERGED, f"IPOPT found a minimum. {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT stopped after {self.max_iterations} iterations; {closed}"
-            return base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
-        return base.Status.STALLED, f"IPOPT found no minimum ({returned}); {closed}; use gauss_newton"
+            limit = f"IPOPT stopped after {self.max_iterations} iterations. {closed}"
+            return base.Status.ITERATION_LIMIT, f"{limit}. Raise solver.max_iterations"
+        return base.Status.STALLED, f"IPOPT found no minimum ({returned}). {closed}. Use gauss_newton"
 
     def _by_condensing(
         self, problem: EstimationProblem, start: Array, recorder: base.AcceptedIterateRecorder
@@ -220,10 +220,10 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             else:
                 if mu > _STALLED_DAMPING:
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
-                    return ended(base.Status.STALLED, f"{reason}; set a shorter node_interval, or use gauss_newton")
+                    return ended(base.Status.STALLED, f"{reason}. Set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
         limit = f"no convergence in {self.max_iterations} iterations (largest jump at a node: {now.defect:.1e})"
-        return ended(base.Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations")
+        return ended(base.Status.ITERATION_LIMIT, f"{limit}. Raise solver.max_iterations")
 
 
 class _AdaptiveRidge(ca.Callback):

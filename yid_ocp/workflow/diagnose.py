@@ -102,7 +102,7 @@ def run_diagnose(
             )
         except KeyboardInterrupt:
             if len(refits):
-                log.warning("%d finished refits are kept in %s; the same command reuses them", len(refits), refits.file)
+                log.warning("%d finished refits are kept in %s. The same command reuses them", len(refits), refits.file)
             raise
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
@@ -335,7 +335,7 @@ class _SingleJsonFileRefitStore(RefitStore):
                 files.write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
-                    log.warning("finished refits cannot be stored, so an interruption would lose them (%s)", error)
+                    log.warning("Finished refits cannot be stored (%s), so an interruption would lose them", error)
                 self._warned = True
 
     def delete_file(self) -> None:
@@ -355,5 +355,5 @@ class _SingleJsonFileRefitStore(RefitStore):
             reason = "they are of other inputs, other settings or another version"
         except (DataError, ValueError, LookupError, TypeError, AttributeError):
             reason = "the file cannot be read"
-        log.warning("all effects are fitted again; the refits in %s are not used, because %s", self.file, reason)
+        log.warning("All effects are fitted again. The refits in %s are not used, because %s", self.file, reason)
         return {}
