@@ -214,8 +214,7 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
     other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
     found = compared({"c": 11.25}, one=best, two=other)
-    values = "a.b = 12.35 N m/rad (not 10), e = 3 N m/rad (not 2)"
-    said = f"gives other values than one, because {why}: {values}"  # no ±
+    said = f"gives other values than one, because {why}: a.b = 12.35 N m/rad (not 10), e = 3 N m/rad (not 2)"  # no ±
     assert found.disagreements == {"one": [], "two": [said]}
     weak, lost = found.explanations
     assert all(fact in weak for fact in ("c (truth 11.25)", "weakly", "5 (one), 99 (two)")), weak
@@ -226,14 +225,9 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     ("a", "b", "status", "said"),
     [
         (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth for all parameters"]),
-        (10.0, 3.0, Status.STALLED, ["b (–, true 2, cannot be found). These are exactly the parameters that are"]),
-        (8.9, 3.0, LIMIT, ["a (8.9, true 10, found), b (–, true 2,", "because the method ended too early (it"]),
-        (
-            11.1,
-            2.0,
-            CONVERGED,
-            ["a, but steepest_descent does not find this, because its", "b (cannot be found) ended"],
-        ),
+        (10.0, 3.0, Status.STALLED, ["b (–, true 2, cannot be found). These are exactly the parameters that are n"]),
+        (8.9, 3.0, LIMIT, ["a (8.9, true 10, found), b (–, true 2", "find this, because the method ended too early"]),
+        (11.1, 2.0, CONVERGED, ["a, but steepest_descent", "find this, because its cost", "b (cannot be found) ended"]),
     ],
 )
 def test_where_the_papers_method_ended_far_from_the_truth(compared, a, b, status, said):
@@ -280,7 +274,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     # what cannot weigh this noise has no verdict of its own
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
-    assert found.disagreements["single_shooting"][0].startswith("gives other values than steepest_descent, because ")
+    assert all(p in found.disagreements["single_shooting"][0] for p in ("values than steepest_descent, b", ": a = 7.5"))
     told = "a (7, true 10, in doubt). The recordings determine a, but steepest_descent does not find this, because it"
     assert told in found.explanations[-1]
 

@@ -486,7 +486,7 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
         "without each, and others in its place, as both stand in another company than when they were added"
     )
     assert [entry.effect for entry in added] == [B, C]
-    assert "removed a@x: the other effects explain as much" in rounds.heard.stages
+    assert "removed a@x, because the other effects explain as much without it" in rounds.heard.stages
 
 
 def test_an_effect_that_is_not_there_any_more_beside_another_is_left_out_again(monkeypatch):
@@ -537,7 +537,7 @@ def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
     assert chosen == ["b", "c"]
     assert added[-1].refitted_model.held_out_loss.chi2_per_sample == pytest.approx(1.25)
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2]
-    assert "explained by b@x and c@x: 93.9 % of the held-out gap closed" in rounds.heard.stages
+    assert "the model now has b@x and c@x (93.9 % of the held-out gap closed)" in rounds.heard.stages
     # from the nominal fit, without those that have the best one in them, which others are tried beside anyway
     assert rounds.refits[2] == (["bc"], 0.0)
     assert rounds.refits[3:] == EACH_LEFT_OUT, "others are tried in the place of either"

@@ -68,10 +68,7 @@ class ParameterShiftsSinceBaseline:
 
 
 def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
-    """Free the parameters that earlier runs estimated, and use these estimates as a joint Gaussian prior.
-
-    Raises `ConfigError` if the model lacks a parameter or effect of the baseline, or a parameter has several values.
-    """
+    """Free the parameters that earlier runs estimated, and use these estimates as a joint Gaussian prior."""
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
         if name not in parameters:

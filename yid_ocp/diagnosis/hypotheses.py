@@ -83,8 +83,7 @@ def _make_candidate(kind: str, place: str, system: System) -> EffectBase:
 def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
     """Return the candidates `effects` without those that `names` lists (as `kind` or `kind@location`).
 
-    Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again. Raises
-    `ConfigError` if a name is not a candidate, or if every candidate is excluded.
+    Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again.
     """
     where = "diagnosis.excluded_candidates"
     known = {name for effect in effects for name in (effect.kind, effect.label)}

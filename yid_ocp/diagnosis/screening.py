@@ -168,10 +168,7 @@ def _changes(
 
 
 def _basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:
-    """Orthonormal basis of the columns of a matrix (n, m), and the coefficients (m, k) of their fit to other columns.
-
-    Linearly dependent columns are left out of the basis.
-    """
+    """Orthonormal basis of the columns of a matrix (n, m), and coefficients (m, k) of their fit to other columns."""
     size = np.linalg.norm(matrix, axis=0)
     scale = np.where(size > 0, size, 1.0)
     u, singular, vt = np.linalg.svd(matrix / scale, full_matrices=False)

@@ -240,7 +240,7 @@ def select_effects(
         base, beside = better.effects, join_effect_labels(better.effects)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
-        search.progress.begin_stage(f"accepted so far: {beside} ({closed.text})".removesuffix(" ()"))
+        search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
         is_full = len(base) >= limits.max_effects
         if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break

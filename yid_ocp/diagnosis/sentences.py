@@ -48,9 +48,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         if told := [text for several, text in advice if len(several) > 1]:
             return f"{told[0]} This can separate these effects: {', '.join([effect.label for effect in rivals])}."
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
-    mostly = _listed(
-        "Record slow and fast motions, with pauses, in which ", place, " (the place of the gap) moves most."
-    )
+    mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " (where the gap is) moves most.")
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
         "unknown": mostly or "Record faster and larger motions of all joints, which show more effects.",
@@ -143,7 +141,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    blind = _listed("These motions would not show the following effects, even if they exist: ", unseen)
+    blind = _listed("These motions would not show these effects, even if they exist: ", unseen, max_entries=len(unseen))
     return [small * is_significant, narrow * (along < level), blind]
 
 

@@ -45,8 +45,7 @@ class EffectAmplitudeTransferCheck:
         here = f"{self.estimation_value:.4g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
         there = f"{self.held_out_value:.4g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
         size = abs(self.estimation_value - self.neutral_value) / math.sqrt(2.0)
-        part = f"70 % of the deviation from {self.neutral_value:g} ({size:.3g}{unit})"
-        limits = f"2 standard deviations ({2 * spread:.2g}{unit}) and {part}"
+        limits = f"2 std ({2 * spread:.2g}{unit}) and 70 % of the change from {self.neutral_value:g} ({size:.3g}{unit})"
         text = f"{self.effect_label}.{self.parameter} is {here} and {there}"
         return f"{text}, so the difference of {apart:.3g}{unit} exceeds {limits}"
 

@@ -57,20 +57,20 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
-    yield SummaryTable(rows, "Where")
+    yield SummaryTable(rows, "Where the gap lies")
     rows = [("event", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "its unit")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
-    yield SummaryTable(rows, "Events")
+    yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     if any(entry["closure"] is not None for entry in result["which"]):
         yield "Refitted candidates come first. Closure: part of the held-out error beyond noise that one alone removes."
     yield "Score: significance of a candidate before a refit. p: probability that noise alone gives such a score."
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    unseen = abbreviated_names_text(result.get("unseen", ()), float("inf"))
+    unseen = abbreviated_names_text(result.get("unseen", ()), float("inf")) if verdict != "no gap" else ""
     yield f"These recordings would not show the following effects, even if they exist: {unseen}." if unseen else ""
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"These effects were not tried, because no recording has the signal {signals}: {', '.join(kinds)}."
@@ -164,9 +164,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
-    seen: TableRows = [
-        ("size / detectable", "cases", "gap found", "kind and place first", "alone or in a set of three")
-    ]
+    seen: TableRows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))

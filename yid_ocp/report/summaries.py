@@ -224,7 +224,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
-    yield from (f"{words[:1].upper()}{words[1:]}." for words in hidden[:_MAX_DIRECTIONS])
+    yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
     yield "Record other motions (`yid-ocp plan`), or fix some (parameters.NAME.free: false)." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
@@ -273,6 +273,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = f"These recordings do not determine the following parameters: {lost}."
     yield SummaryStatement(said if lost else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
+    yield "Noise alone gives 1 std. If all errors are far larger, run `yid-ocp diagnose`." if unit == "std" else ""
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     joints = abbreviated_names_text(result["joints"])
@@ -402,7 +403,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     equations, linear = result["equations"], result["linearisation"]
-    size = f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}"
+    size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {equations['sizes']['m']}."
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
@@ -415,7 +416,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
         yield "The column 'observed' is left out, because it can be computed only at an equilibrium."
     said = f"The spectral radius of A, linearised at {linear['at']}, is {linear['spectral_radius']:.6g}."
-    yield SummaryStatement(said, "verdict")
+    yield SummaryStatement(f"{said} Above 1, small deviations grow.", "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else ""

@@ -124,8 +124,9 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
     """Return what recorded torques that a result does not use could tell. Empty if there are none."""
-    key = "sensors.joints.effort.use: true"
-    said = f"Recorded torques are not used: set {key} to find friction (`yid-ocp friction`) and loads of the arm."
+    said = (
+        "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
+    )
     return said if result.get("unused_efforts") else ""
 
 

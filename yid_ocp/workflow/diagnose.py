@@ -305,10 +305,7 @@ def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
 
 
 class _SingleJsonFileRefitStore(RefitStore):
-    """A store of refits in one JSON file, replaced as a whole after every refit.
-
-    A file from other inputs, another configuration or another version is ignored with a notice.
-    """
+    """A store of refits in one JSON file, replaced as a whole after every refit."""
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.resume_folder / "refits.json"
