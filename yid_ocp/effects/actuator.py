@@ -79,7 +79,7 @@ class _EncoderOffset(_DistortedReading):
     equation = "measured angle = true + offset"
     required_excitation = "the orientation to gravity"
     possible_locations = _recorded_joints
-    declared_parameters = (ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured less true"),)
+    declared_parameters = (ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured - true"),)
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["offset"]
@@ -164,7 +164,7 @@ class _EffortGain(_DistortedEffort):
     equation = "measured effort = scale x true"
     declared_parameters = (
         replace(
-            ParameterDefinition("inverse", "1", 1.0, -1.5, 3.0, (1 / 1.2, 1 / 0.8), "true over measured effort"),
+            ParameterDefinition("inverse", "1", 1.0, -1.5, 3.0, (1 / 1.2, 1 / 0.8), "true effort over measured effort"),
             reported_reciprocal="scale 1",
         ),
     )
@@ -191,7 +191,7 @@ class _EffortOffset(_DistortedEffort):
     equation = "measured effort = true + offset"
     declared_parameters = (
         replace(
-            ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),
+            ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured minus true effort"),
             range_scale=base.effort_limit_ratio_to_baxter,
         ),
     )
@@ -221,7 +221,7 @@ class _EffortDelay(_LateTorque):
 
     equation = "the torque that acts at t was recorded at t - delay"
     possible_locations = _effort_arms
-    declared_parameters = (ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late the torque acts"),)
+    declared_parameters = (ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "delay of the torque"),)
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         return self._lateness(channel, self.arm_joints, self["delay"])
@@ -242,7 +242,7 @@ class _EffortLag(_LateTorque):
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of the parameter `time_constant` [s]. Only prescribed joints allow negative values."""
-        least, text = -0.5 if location in system.prescribed else 0.0, "with which torque follows its command"
+        least, text = -0.5 if location in system.prescribed else 0.0, "time constant of torque after command"
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
@@ -270,7 +270,7 @@ class _ServoGain(_ServoChange):
 
     equation = "demand = scale (gain (u - q) - damping v)"
     declared_parameters = (
-        ParameterDefinition("scale", "1", 1.0, 0.05, 20.0, (0.3, 3.0), "true over nominal torque of the servo"),
+        ParameterDefinition("scale", "1", 1.0, 0.05, 20.0, (0.3, 3.0), "true torque of the servo over the nominal one"),
     )
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
@@ -285,7 +285,7 @@ class _SupplyVoltage(_ServoChange):
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
     possible_locations = _dc_motor_joints
-    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 5.0, (0.5, 1.5), "true over nominal voltage"),)
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.2, 5.0, (0.5, 1.5), "true/nominal voltage"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         tightness = servo.torque_limit_tightness * self["scale"] ** -TORQUE_SATURATION_EXPONENT
@@ -301,7 +301,7 @@ class _BackEmf(_ServoChange):
     required_excitation = "the speed"
     possible_locations = _dc_motor_joints
     declared_parameters = (
-        ParameterDefinition("scale", "1", 1.0, 0.0, 20.0, (0.0, 3.0), "true over nominal torque per speed"),
+        ParameterDefinition("scale", "1", 1.0, 0.0, 20.0, (0.0, 3.0), "true torque per speed over the nominal one"),
     )
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
@@ -330,7 +330,7 @@ class _ServoDelay(_ServoChange):
     equation = "the command that acts at t was given at t - servo_delay - delay"
     required_excitation = "the rate of its readings"
     declared_parameters = (
-        ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),
+        ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "delay of commands beyond servo_delay"),
     )
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:

@@ -112,7 +112,7 @@ class _PointMass(EffectBase):
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of `mass` [kg]. The upper bound is the object's mass or, on an arm, the arm's payload limit."""
         upper, expected = _bearable(system, location)
-        return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
+        return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass added at the point"),)
 
     def apply_to_system(self, system: System) -> System:
         frame = system.mechanism.frame(self.location)
@@ -304,7 +304,7 @@ class _GravityScale(EffectBase):
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "the orientation to gravity"
     possible_locations = lambda system: ("object",) if system.segment_layouts else ()
-    declared_parameters = (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "added over full weight"),)
+    declared_parameters = (ParameterDefinition("fraction", "1", 0.0, -2.0, 2.0, (-1.0, 1.0), "added weight"),)
 
     def apply_to_system(self, system: System) -> System:
 

@@ -107,8 +107,8 @@ class _JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        effort_scaled_parameter_definition("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
-        ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
+        effort_scaled_parameter_definition("tau_s", "N m", 10.0, 2.0, "friction at low speed added to tau_c"),
+        ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed above which it vanishes", True),
     )
 
     def _friction(self, v: ca.SX) -> ca.SX:
@@ -163,8 +163,8 @@ class _JointPresliding(EffectBase):
     required_excitation = "the speed"
     possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
-        ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
+        effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),
+        ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle until it slides", True),
     )
     declared_internal_coordinate_names = ("s",)  # the fraction of tau_c that acts, from -1 to 1
 
@@ -205,7 +205,7 @@ class _JointSpring(EffectBase):
     possible_locations = base.arm_joint_names
     declared_parameters = (
         effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
-        ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
+        ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "angle without torque", True),
     )
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:

@@ -81,8 +81,8 @@ class _StandardLinearSolid(_SegmentMemory):
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
     declared_parameters = (
-        ParameterDefinition("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of branch over that of spring"),
-        ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", True),
+        ParameterDefinition("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness that relaxes over the lasting one"),
+        ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "relaxation time", True),
     )
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
@@ -194,7 +194,7 @@ class _BendAnisotropy(_SpringChange):
     equation = "kappa_y = kappa_x (1 + ratio)"
     possible_locations = _doubly_bending_segments
     declared_parameters = (
-        ParameterDefinition("ratio", "1", 0.0, -0.9, 3.0, (-0.3, 0.3), "excess of the bending stiffness about y"),
+        ParameterDefinition("ratio", "1", 0.0, -0.9, 3.0, (-0.3, 0.3), "stiffness about y over that about x, minus 1"),
     )
 
     def _changed(self, spring: ElasticJoint) -> ElasticJoint:

@@ -159,7 +159,7 @@ class _GraspSlip(_GraspChange):
     equation = "d(offset)/dt = slip_per_load x axial load"
     required_excitation = "the holding time"
     declared_parameters = (
-        ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), "creep rate per axial load"),
+        ParameterDefinition("slip_per_load", "m/(N s)", 0.0, 0.0, 0.1, (0.0, 0.01), "speed of creep per axial load"),
     )
     declared_internal_coordinate_names = ("offset",)  # the slipped distance along the tube [m]
 

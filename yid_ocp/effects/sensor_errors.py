@@ -39,7 +39,7 @@ class _CameraTranslation(_CameraEffect):
 
     equation = "seen point = true + (x, y, z)"
     declared_parameters = tuple(
-        ParameterDefinition(axis, "m", 0.0, -0.3, 0.3, (-0.03, 0.03), f"seen less true {axis}") for axis in "xyz"
+        ParameterDefinition(axis, "m", 0.0, -0.3, 0.3, (-0.03, 0.03), f"seen minus true {axis}") for axis in "xyz"
     )
 
     def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
@@ -78,7 +78,7 @@ class _SurfaceOffset(_CameraEffect):
     equation = "seen point = true + fraction r (c - true)/|c - true|"
     possible_locations = lambda system: _camera(system) if system.segment_layouts else ()
     declared_parameters = (
-        ParameterDefinition("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "distance from the axis over the radius"),
+        ParameterDefinition("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "shift toward the camera over the radius"),
     )
 
     def _seen(self, point: ca.SX, camera: Placement, state: NodeStateSymbols) -> ca.SX:
@@ -100,7 +100,7 @@ class _CameraLatency(_CameraEffect):
     required_excitation = "the rate of its readings"
     required_sensors = frozenset()
     is_at_point_groups = True
-    declared_parameters = (ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago it was there"),)
+    declared_parameters = (ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "delay of the seen points"),)
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
@@ -162,7 +162,7 @@ class _SensorBias(_MountedSensorEffect):
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of the bias of each component, such as `force_x` [N] or `specific_force_x` [m/s^2]."""
         return tuple(
-            ParameterDefinition(f"{quantity}_{axis}", unit, 0.0, -most, most, (-usual, usual), "measured less true")
+            ParameterDefinition(f"{quantity}_{axis}", unit, 0.0, -most, most, (-usual, usual), "measured minus true")
             for quantity, unit, most, usual in _MOUNTED_COMPONENTS[location.partition(":")[0]]
             for axis in "xyz"
         )

@@ -234,8 +234,8 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
     torque, per = ("N m", "N m/rad") if joint.coordinate_unit == "rad" else ("N", "N/m")
     rows: tuple[tuple[str, float, str, float, float, str], ...] = (
         ("gain", gain, per, 0.0, math.inf, "torque per error of the angle"),
-        ("damping", _DEFAULT_DAMPING_TIME * gain, per.replace("/", " s/"), 0.0, math.inf, "torque against the rate"),
-        ("delay", 0.0, "s", 0.0, _MAX_COMMAND_DELAY, "from a command to its torque"),
+        ("damping", _DEFAULT_DAMPING_TIME * gain, per.replace("/", " s/"), 0.0, math.inf, "damping of the motion"),
+        ("delay", 0.0, "s", 0.0, _MAX_COMMAND_DELAY, "delay from a command to its torque"),
         ("torque_limit", limit, torque, 1e-3, math.inf, "largest torque"),
     )
     return [
@@ -249,7 +249,7 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
     rate, words = "N m s/rad" if angle == "rad" else "N s/m", f"servo of {joint.name}"
     known = {
         "integral": ("1/s", 0.0, math.inf, f"integral over proportional gain, {words}"),
-        "derivative": (rate, 0.0, math.inf, f"torque against the rate within the duty's limit, {words}"),
+        "derivative": (rate, 0.0, math.inf, f"damping within the limit of the duty cycle, {words}"),
         "dead_band": (angle, 0.0, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
     }
     return {term: Parameter(f"{joint.name}.servo_{term}", 0.0, *known[term]) for term in dict.fromkeys(terms)}
