@@ -119,7 +119,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert "none is known to within 10 %" in told("yid-solve/1", unsure)[2]
     assert "10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[2]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
-    worse, text = "without a model: w_T2 of run, 50 mm against 20 mm (stays)", " ".join(told("yid-solve/1", said)[:9])
+    worse, text = "without a model: w_T2 of run, 50 mm against 20 mm by 'stays'", " ".join(told("yid-solve/1", said)[:9])
     assert (text.index(first), worse in text, "; 2 more in" in text) == (0, True, True)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in " ".join(lines[:7])
@@ -132,10 +132,10 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
 @pytest.mark.parametrize(
     ("error", "noise", "fit", "said"),
     [
-        (0.012, 0.010, GOOD, ". Torque noise of the stated size gives 10 mm, so there is no gap. The guess "),
+        (0.012, 0.010, GOOD, ". Stated torque noise gives 10 mm, and up to twice this there is no gap. The guess "),
         (0.012, 0.002, GOOD, ". Noise alone gives 2 mm, less than half, so there is a gap. Run `yid-ocp diagnose`"),
         (0.003, 0.002, GOOD, None),
-        (0.003, 0.0027, GOOD, ". Torque noise of the stated size gives 2.7 mm, so there is no gap. The guess "),
+        (0.003, 0.0027, GOOD, ". Stated torque noise gives 2.7 mm, and up to twice this there is no gap. The guess "),
         (0.003, 0.002, BAD, ". Noise alone gives 2 mm. The guess that every reading keeps its"),
     ],
 )

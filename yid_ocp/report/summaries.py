@@ -133,7 +133,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{text} Noise alone gives {sizes[2]}, less than half, so there is a gap. {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text} Torque noise of the stated size gives {sizes[2]}, so there is no gap.{guess}"
+            yield f"{text} Stated torque noise gives {sizes[2]}, and up to twice this there is no gap.{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -198,7 +198,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
-                what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}"
+                what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = f"Widen parameters.{name}.bounds, or fix {name} there if the bound is a physical limit."
                 yield f"{what}, so values beyond it were not tried. {remedy}"
 
