@@ -119,7 +119,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert "none is known to within 10 %" in told("yid-solve/1", unsure)[2]
     assert "10 %" not in told("yid-solve/1", unsure | {"fit": BAD | {"data_trusted": False}})[2]
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
-    worse, text = "without a model: w_T2 of run, 50 mm against 20 mm by 'stays'", " ".join(told("yid-solve/1", said)[:9])
+    worse, text = "a model: w_T2 of run, 50 mm against 20 mm by 'stays'", " ".join(told("yid-solve/1", said)[:9])
     assert (text.index(first), worse in text, "; 2 more in" in text) == (0, True, True)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in " ".join(lines[:7])

@@ -167,9 +167,7 @@ def misfit_summary_blocks(
     texts, worse = list[str](), fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
-        texts.append(
-            f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} (guess '{entry['baseline']}')"
-        )
+        texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} by '{entry['baseline']}'")
     texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
     said = f"The rms error of these channels is larger than that of a guess without a model: {'; '.join(texts)}."
     yield SummaryStatement(said if texts else "", "verdict")
