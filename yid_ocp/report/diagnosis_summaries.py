@@ -77,7 +77,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
-        moved = "unknown" if entry["score"] is None else f"{entry['score']:+.2g} std"
+        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     yield SummaryTable(rows, "Since the baseline")
     rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]

@@ -80,7 +80,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
             errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
-            worse = f"; that of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
+            worse = f". The error of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
         level = f"Its chi² per degree of freedom is {first:.3g} (noise alone gives 1)"
@@ -226,7 +226,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         return None
     absolute = "as a decrease of chi²; chance alone exceeds 7 in 1 % of cases"
     unit = "as a fraction of the error beyond noise" if percent else absolute
-    promise = f"the decrease of the misfit on fitted motions that a linear model predicts for each effect, {unit}."
+    promise = f"the decrease of the misfit on fitted motions that a linear model promises for each effect, {unit}."
     refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
     why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
     unmeasured = f"Refitted: {refitted}. Held-out motions cannot show how much of the gap these effects close{why}."
