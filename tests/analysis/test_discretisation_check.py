@@ -55,7 +55,7 @@ def test_too_few_links_are_told_and_counted(coarse):
     assert -error < moved < -0.4 * error
     said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
     assert "With twice the links, these estimates would change by more than their" in said
-    assert re.search(r"twice the links would remove 3\d % of the error beyond noise, so first double `links`", said)
+    assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sdouble", said)
 
 
 def test_python_and_shell_say_the_same(coarse):

@@ -253,8 +253,8 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert [("base@x" in stage, "3 effects" in stage) for stage in heard.stages] == [(True, True)]
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
     assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
-    told = sorted((text.split()[2].rstrip(":"), text.split()[-1]) for done, _, text in heard.parts if done)
-    assert told == [("friction@elbow", "1.234"), ("offset@elbow", "1.234"), ("third@x", "fit")]
+    told = sorted((text.split()[3], text.split()[-1]) for done, _, text in heard.parts if done)
+    assert told == [("friction@elbow", "1.234"), ("offset@elbow", "1.234"), ("third@x", "failed")]
     assert refit_with_each_effect(search, (), [((lost,), {})], {}) == [], "it predicts no held-out recording"
     assert asked[3][0] is TWO_RECORDINGS, "a step for one refit costs more than it saves"
     # from elsewhere they have names of their own in the store
