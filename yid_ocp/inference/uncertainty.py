@@ -36,7 +36,7 @@ _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH = 24, 0.25, 2.0
 _MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8
 # The Gaussian approximation is rejected if the cost rises by less than this fraction of the predicted rise.
 _MIN_COST_RISE_RATIO = 0.5
-# With more parameters, two rollouts per parameter take longer than the search itself.
+# Two rollouts for each of more parameters take longer than the search itself.
 _MAX_CHECKED_PARAMETERS = 12
 _PRIOR_STD_RATIO = 3.0  # factor on a standard deviation without priors, from which on priors determine an unknown
 _MIN_PRIOR_SHARE = 0.5  # of the largest deviation from a prior [stds], from which on another prior is named, too
@@ -235,19 +235,18 @@ def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation,
 
 
 def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
-    """Standard deviation of each unknown, (nx,). Those of poorly determined parameters are checked against the cost.
+    """Standard deviation of each unknown, (nx,). Those of parameters are checked against the cost, positive ones first.
 
-    If the cost rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that
+    A stiff object vibrates too fast for the samples, and its derivatives promise more than the cost holds. If the cost rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that
     of a parabola through this point. It is very large if the cost does not rise.
     """
     spread = _std_from_covariance(covariance)
     lower, upper = problem.bounds
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
-    parameters = parameter_unknown_names(problem)
-    for name in parameters if len(parameters) <= _MAX_CHECKED_PARAMETERS else ():
-        i = problem.unknown_names.index(name)
+    parameters = map(problem.unknown_names.index, parameter_unknown_names(problem))
+    for i in sorted(parameters, key=lambda i: not problem.positive_unknowns_mask[i])[:_MAX_CHECKED_PARAMETERS]:
         size = max(abs(float(x[i])), float(problem.unknown_scales[i]))
-        if not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_RELATIVE_STD_TAKEN_AS_INFINITE * size:
+        if not 0 < spread[i] < MIN_RELATIVE_STD_TAKEN_AS_INFINITE * size:
             continue
         heights = []
         for sign, room in ((-1.0, float(x[i] - lower[i])), (1.0, float(upper[i] - x[i]))):
