@@ -237,8 +237,9 @@ def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation,
 def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array) -> Array:
     """Standard deviation of each unknown, (nx,). Those of parameters are checked against the cost, positive ones first.
 
-    A stiff object vibrates too fast for the samples, and its derivatives promise more than the cost holds. If the cost rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that
-    of a parabola through this point. It is very large if the cost does not rise.
+    A stiff object vibrates too fast for the samples, and its derivatives promise more than the cost holds. If the cost
+    rises to less than half of its prediction at an end of the 95 % interval, the standard deviation is that of a
+    parabola through this point. It is very large if the cost does not rise.
     """
     spread = _std_from_covariance(covariance)
     lower, upper = problem.bounds
