@@ -36,12 +36,14 @@ NEUTRAL = {
     "min_log_bayes_factor": 1.92,  # that of a 95 % interval
     "prior_range_margin_in_widths": 1e9,
     "min_explained_fraction": 0.0,
+    "min_closure": 0.0,
 }
 """Values at which a threshold asks for nothing, or for as little as makes sense."""
 CONSTANTS = {
     "_LOSS_RTOL": (select, 1e-12),
     "_MIN_CHI2_FRACTION": (select, 0.0),
     "_LOG_ODDS_FACTOR": (select, 1.0),
+    "_MIN_FURTHER_CLOSURE": (select, 0.0),
     "_SET_PROBABILITY": (select, 1.0),
 }
 """Constants of modules, with their neutral values."""
@@ -54,8 +56,7 @@ CRITERIA = {
     "significant effects": (select, "_is_needed", "is_clear and all(", "is_clear or not all("),
     "two thirds of a small gap": (verdict, "_explained_fraction", "min(least, limits", "min(math.inf, limits"),
     "small gaps": (verdict, "_explained_fraction", "1.0 if fits_to_noise and", "1.0 if False and"),
-    "differs from neutral": (verdict, "_compare", "is_consistent=any(away)", "is_consistent=True"),
-    "first effect alone": (verdict, "judge", "and len(added) > 1", "and False"),
+    "size is determined": (verdict, "_verdict", "bool(said.undetermined_effects(limits))", "False"),
 }
 """Conditions in code: module, function, the text and what replaces it."""
 

@@ -163,9 +163,9 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=N
     return SelectedEffect(of, fitted, part or closed(), (of, *rivals), (1.0,) + (0.0,) * len(rivals))
 
 
-def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> EffectAmplitudeTransferCheck:
-    """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return EffectAmplitudeTransferCheck("friction@elbow", name, "N m", *np.ravel([values, stds], "F"), 0.0, agrees)
+def carried(of: EffectBase, values=(0.5, 0.9), stds=(0.01, 0.02)) -> EffectAmplitudeTransferCheck:
+    """The amplitude of an effect on the recordings to estimate on and on the held-out ones."""
+    return EffectAmplitudeTransferCheck(of, f"{of.label}.a", *np.ravel([values, stds], "F"))
 
 
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")

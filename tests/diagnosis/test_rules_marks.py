@@ -326,8 +326,8 @@ def again(finding, **limits):
     "made, limits, verdict",
     {
         "by the same": ({}, {}, "effect"),
-        "too little explained": ({"decrease": 120.0}, {}, "unknown"),
-        "less is asked": ({"decrease": 120.0}, {"min_explained_fraction": 0.5}, "effect"),
+        "too little explained": ({"decrease": 120.0}, {"min_closure": 0.9}, "unknown"),
+        "less is asked": ({"decrease": 120.0}, {"min_closure": 0.9, "min_explained_fraction": 0.5}, "effect"),
         "another value elsewhere": ({"there": 0.8}, {}, "effect"),
         "the opposite elsewhere": ({"there": -0.5}, {}, "unknown"),
         "no gap is sure enough": ({}, {"gap_significance_level": 1e-30}, "no_gap"),
@@ -340,10 +340,10 @@ def test_what_was_kept_of_a_case_is_judged_by_other_thresholds(made, limits, ver
 
 
 def test_a_case_keeps_its_own_thresholds_as_far_as_there_still_are_such():
-    asked = Thresholds(min_explained_fraction=0.5)
+    asked = Thresholds(min_explained_fraction=0.5, min_closure=0.9)
     made = blind_scores.diagnosis_evidence_to_dict(replace(diagnosed(decrease=120.0), thresholds=asked))
     assert rejudge_diagnosis_evidence(made, {})["verdict"] == "effect"
-    made["thresholds"] = {"min_explained_fraction": 0.8, "one_that_is_gone": 3.0}
+    made["thresholds"] = {"min_explained_fraction": 0.8, "min_closure": 0.9, "one_that_is_gone": 3.0}
     assert rejudge_diagnosis_evidence(made, {})["verdict"] == "unknown"
 
 

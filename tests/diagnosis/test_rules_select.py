@@ -339,7 +339,7 @@ def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too
     assert Rounds(monkeypatch, losses).compose(moved=True)[1] == ["a"]
 
 
-GROWING = {"": 5.0, "a": 3.0, "b": 4.0, "c": 4.5, "ab": 2.0, "ac": 2.5, "abc": 1.5, "bc": 3.5}
+GROWING = {"": 5.0, "a": 3.0, "b": 4.0, "c": 4.5, "ab": 1.8, "ac": 2.1, "abc": 1.3, "bc": 3.5}
 GROWING = {kinds: (chi2, chi2 + 0.2) for kinds, chi2 in GROWING.items()}
 
 
@@ -350,7 +350,7 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
     assert [screened[:2] for screened in rounds.screens[:2]] == [(["a"], 1.0), (["a", "b"], 2.0)]
     closed = [entry.cumulative_closure.fraction for entry in added]
-    assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
+    assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 0.9 / 4.1, 1 - 0.4 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
     assert "scoring further effects beside a@x and b@x" in rounds.heard.stages
     alone = [what for what, *_ in rounds.refits[3:] if "without" in what]

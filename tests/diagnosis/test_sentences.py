@@ -128,30 +128,31 @@ def effects():
 
 def unknown():
     """Why a gap has no name, with the numbers that decide it."""
-    both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
+    both = fit(
+        [FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25}, std={"offset@wrist.a": 0.2}
+    )
+    unsure = (added(FRICTION, fitted=fit([FRICTION], values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": 0.3})),)
     for name, reason, changed in [
         ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
-        ("imitates", "stand_in", {"gap_closure": closed(0.91), "transfer_checks": (carried(),)}),
-        ("imitates by one of two", "stand_in", {
-            "transfer_checks": (carried(agrees=True, name="b", values=(3.0, 3.1)), carried(stds=(0.01, 0.02)))}),
+        ("imitates", "stand_in", {"selected_effects": unsure, "transfer_checks": (carried(FRICTION),)}),
+        ("of a size that is not known", "stand_in", {"selected_effects": unsure}),
         *((f"two effects, {reason}", reason, {
             "selected_effects": (added(FRICTION), added(OFFSET, fitted=both)),
-            "explained_fraction": 0.31, "gap_closure": closed(0.4, 0.01, 0.7), "transfer_checks": (carried(),),
+            "explained_fraction": 0.31, "gap_closure": closed(0.4, 0.01, 0.7), "transfer_checks": (carried(OFFSET),),
         }) for reason in REASONS),
     ]:  # fmt: skip
         limits = Thresholds(min_explained_fraction=0.5)
         yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
     for reason in REASONS:
-        none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(),)}
+        none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(FRICTION),)}
+        none |= {"selected_effects": unsure if reason == "stand_in" else (added(FRICTION),)}
         none |= {"nominal_held_out_test": outcome(), "remaining_test": outcome(), "explained_fraction": 0.31}
         yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
     joints = [effect(f"friction@{name}") for name in ("elbow", "wrist", "waist")]
     for of, p_values in (("two joints", (1e-9, 3e-5, 4e-5)), ("one joint", (1e-9, 4e-5, 4e-5))):
         seen = screening([score(own, p=p) for own, p in zip(joints, p_values, strict=True)])
-        yield (
-            f"significant at {of}",
-            finding("unknown", unknown_reason="little", explained_fraction=0.31, screening=seen),
-        )
+        few = {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}
+        yield f"significant at {of}", finding("unknown", unknown_reason="little", screening=seen, **few)
     hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield (
@@ -230,7 +231,7 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
     tests = {"nominal_test": outcome(p, chi2=fitted), "nominal_held_out_test": outcome(p, chi2=held_out)}
     known = {**tests, "gap_closure": closure, "nominal_model": fit(lost=lost)}
     verdict = how if how in ("effect", "no_gap") else "unknown"
-    none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(),)}
+    none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(FRICTION),)}
     made = finding(verdict, **known, **none, **({} if verdict == how else {"unknown_reason": how}))
     assert_nothing_impossible_is_said(made, diagnosis_summary_text(made))
 

@@ -141,6 +141,11 @@ class RefitStatistics(StoredFit):
 
         return [name for name, ends in effect.prior_ranges.items() if is_outside(name, *ends)]
 
+    def determines_size(self, effect: EffectBase, min_z: float) -> bool:
+        """Check whether an amplitude of an effect differs from its neutral value by more than `min_z` stds."""
+        names, neutral = effect.amplitude_parameter_names, effect.neutral_values
+        return any(abs(self.values[n] - neutral[n]) > min_z * self.std.get(n, 0.0) for n in names)
+
 
 @dataclass(frozen=True)
 class RefittedModel(RefitStatistics):

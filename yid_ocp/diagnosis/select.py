@@ -23,6 +23,7 @@ _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' 
 _MIN_CHI2_FRACTION = 0.05**2
 _LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds that simulated cases show
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
+_MIN_FURTHER_CLOSURE = 0.4  # of what is left, by an effect that is not the only one
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
@@ -167,10 +168,13 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better."""
+    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
+
+    Beside other effects, they must also close a good part of what is left: less may be the others' errors.
+    """
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = chi2_per_sample_decrease_and_std_error(before, after)
-    is_clear = gained > error
+    is_clear = gained > max(error, _MIN_FURTHER_CLOSURE * before.excess_chi2_per_sample * bool(without.effects))
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
     # the amplitudes of an effect together are at least as significant as one amplitude at `min_z` standard deviations
@@ -361,15 +365,6 @@ def _equivalents_and_shares(
     order = np.array([0, *1 + np.argsort(-shares[1:], kind="stable")])
     kept = order[np.cumsum(shares[order]) - shares[order] < _SET_PROBABILITY]
     return tuple(effects[i] for i in kept), tuple(shares[kept].tolist())
-
-
-def effect_with_its_equivalents(
-    entry: SelectedEffect, nominal: RefitStatistics, fits: Sequence[RefitStatistics], limits: Thresholds
-) -> SelectedEffect:
-    """Return `entry` as the only selected effect, with its equivalent effects among the `fits` of single effects."""
-    near = [(fit.effects[-1], distance) for fit, distance in _near_best_models(nominal, fits, limits)]
-    effects, shares = _equivalents_and_shares(entry.effect, near)
-    return replace(entry, equivalent_effects=effects, shares=shares)
 
 
 def widen_refit_stds_by_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:

@@ -23,7 +23,6 @@ MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_CHANGES = 5  # number of named parameters, the largest changes first
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
-_FRICTION_KINDS = ("joint_viscous", "joint_coulomb", "joint_stribeck", "joint_load_friction", "joint_presliding")
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
     "plant": "the mechanics, not a sensor",
@@ -175,15 +174,21 @@ def _causes(result: DiagnosisResult) -> list[str]:
     rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
     text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
-    own, goal = 100 * result.explained_fraction, 100 * result.required_total_explained_fraction(limits)
-    apart = ". ".join(entry.disagreement_text for entry in result.failed_transfer_checks[:2])
-    either = f"If {names} changed between the recordings, diagnose them separately. Otherwise another cause acts"
+    (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
+    few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
+    end = (
+        f" and, at the lower end of the interval, {100 * closed:.3g} % on held-out motions (needed: {100 * goal:.3g} %)"
+    )
+    unsure = " and ".join(effect.label for effect in result.undetermined_effects(limits))
+    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} ± or more from the one without effect"
+    apart = "".join(f". {text}" for text in result.undetermined_size_texts[:2])
+    either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none = "No cause is named, because"
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": f"{none} none of the effects that were tried explains the error well enough.",
-        "little": f"{none} {names} explain{s} only {own:.3g} % of the error on fitted motions ({goal:.3g} % needed).",
-        "stand_in": f"{none} {names} do{'es' * bool(s)} not transfer to the held-out recordings: {apart}. {either}.",
+        "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
+        "stand_in": f"{none} {size}{apart}. {either}.",
     }
     return [*text, reasons[result.unknown_reason], _several_places(result)]
 
@@ -196,9 +201,7 @@ def _several_places(result: DiagnosisResult) -> str:
     if not result.unknown_reason or len(alike) < 2:
         return ""
     said = f"{best[0]} is significant at several locations (p below {level / len(scores):.2g}): "
-    advice = "Add it there under model.effects, and repeat `yid-ocp diagnose`"
-    if best[0] in _FRICTION_KINDS:
-        advice = "Run `yid-ocp friction`, set model.friction as it advises, and repeat `yid-ocp diagnose`"
+    advice = "Add it there under model.effects (friction: as `yid-ocp friction` advises), and repeat `yid-ocp diagnose`"
     return f"{said}{abbreviated_names_text([s.effect.location for s in alike])}. {advice}."
 
 
@@ -220,14 +223,13 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
-    values, odd, neutral = [], "", effect.neutral_values
+    values, odd, is_unsure = [], "", not fit.determines_size(effect, limits.min_z)
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} {known if math.isfinite(r.std) else '= unknown'}")
     for name in fit.implausible_parameters(effect, limits):
         low, high = effect.prior_ranges[name]
         odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
-    is_unsure = all(abs(fit.values[n] - neutral[n]) <= fit.std.get(n, 0.0) for n in effect.amplitude_parameter_names)
     return f"  {effect.label}: {', '.join(values)}{odd}{' (these recordings do not determine its size)' * is_unsure}"
 
 

@@ -47,8 +47,14 @@ class Thresholds:
         float, Ge(0), OptionInfo("how far a value may leave its usual range: in widths, or a factor of 1 + this")
     ] = 1.0
     min_explained_fraction: Annotated[
-        float, Ge(0), Le(1), OptionInfo("explained fraction or closure that one effect must reach")
+        float,
+        Ge(0),
+        Le(1),
+        OptionInfo("fraction of the fitted gap that one effect must explain, if its closure is too small"),
     ] = 0.75
+    min_closure: Annotated[
+        float, Ge(0), Le(1), OptionInfo("lower end of the closure's 95 % interval that one effect must reach otherwise")
+    ] = 0.4
     # where the gap lies, and when
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0
     max_joint_speed: Annotated[

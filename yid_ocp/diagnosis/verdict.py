@@ -28,35 +28,26 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 class EffectAmplitudeTransferCheck:
     """A comparison of two estimates of one effect parameter, from the estimation and the held-out recordings."""
 
-    effect_label: str
-    parameter: str
-    unit: str
+    effect: EffectBase
+    parameter: str  # with the label of the effect
     estimation_value: float
     estimation_std: float
     held_out_value: float
     held_out_std: float
-    neutral_value: float
-    is_consistent: bool
 
     @property
-    def disagreement_text(self) -> str:
-        """A text with both estimates, their difference and the limits that it exceeds if they are inconsistent."""
-        (apart, spread), unit = self._difference_and_std, f" {self.unit}".removesuffix(" 1")
+    def text(self) -> str:
+        """A text with both estimates."""
+        unit = f" {self.effect.parameters[self.parameter].unit}".removesuffix(" 1")
         here = f"{self.estimation_value:.4g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
         there = f"{self.held_out_value:.4g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
-        size = abs(self.estimation_value - self.neutral_value) / math.sqrt(2.0)
-        limits = f"2 std ({2 * spread:.2g}{unit}) and 70 % of the change from {self.neutral_value:g} ({size:.3g}{unit})"
-        text = f"{self.effect_label}.{self.parameter} is {here} and {there}"
-        return f"{text}, so the difference of {apart:.3g}{unit} exceeds {limits}"
-
-    @property
-    def _difference_and_std(self) -> tuple[float, float]:
-        return abs(self.estimation_value - self.held_out_value), math.hypot(self.estimation_std, self.held_out_std)
+        return f"{self.parameter} is {here} and {there}"
 
     @property
     def significant_disagreement_as_std(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
-        apart, spread = self._difference_and_std
+        apart = abs(self.estimation_value - self.held_out_value)
+        spread = math.hypot(self.estimation_std, self.held_out_std)
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
@@ -129,10 +120,10 @@ class Judgement:
         rivals, probability = tuple(names), self.probability * share
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
-    @property
-    def failed_transfer_checks(self) -> tuple[EffectAmplitudeTransferCheck, ...]:
-        """The checks in which estimation and held-out recordings give different values of an effect parameter."""
-        return tuple(entry for entry in self.transfer_checks if not entry.is_consistent)
+    def undetermined_effects(self, limits: Thresholds) -> list[EffectBase]:
+        """List the selected effects whose size is within `min_z` stds of neutral; stds include the remaining gap."""
+        effects, last = [entry.effect for entry in self.selected_effects], self.selected_effects[-1:]
+        return [e for e in effects for own in last if not own.refitted_model.determines_size(e, limits.min_z)]
 
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
@@ -154,31 +145,37 @@ class Judgement:
             for effect, share in zip(entry.equivalent_effects, entry.shares, strict=True)
         }
 
-    @property
-    def _largest_explained_fraction(self) -> float:
-        """Explained fraction of the gap: fitted, or if larger the 95 % lower limit of the held-out closure."""
-        return max(self.explained_fraction, self.closure_by_selected_effects.ci_low)
+    def required_total_fraction(self, of_one: float) -> float:
+        """Compute the fraction of the gap that the selected effects must explain if one must explain `of_one`.
 
-    def required_total_explained_fraction(self, limits: Thresholds) -> float:
-        """Compute the fraction of the gap that the selected effects must explain to be accepted.
-
-        For k independent effects (one per local effect and one per other kind) it is
-        1 - (1 - `min_explained_fraction`)^k: each must explain that part of the remainder.
+        For k independent effects (one per local effect and one per other kind) it is 1 - (1 - `of_one`)^k: each must
+        explain that part of the remainder.
         """
         effects = (entry.effect for entry in self.selected_effects)
         independent = {effect.label if effect.is_local else effect.kind for effect in effects}
-        return 1.0 - (1.0 - limits.min_explained_fraction) ** len(independent)
+        return 1.0 - (1.0 - of_one) ** len(independent)
+
+    def explained_and_required_fractions(self, limits: Thresholds) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the explained and the required fraction of the gap, of fitted r'r and of held-out errors.
+
+        One of the two must suffice. Held-out errors count at the lower end of the closure's 95 % interval.
+        """
+        closed = self.closure_by_selected_effects.ci_low
+        pairs = (self.explained_fraction, limits.min_explained_fraction), (closed, limits.min_closure)
+        fitted, held_out = ((part, self.required_total_fraction(least)) for part, least in pairs)
+        return fitted, held_out
 
 
 def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) -> tuple[str, _UnknownVerdictReason]:
-    """The verdict, and the first reason why no effect is accepted. See `required_total_explained_fraction`.
+    """The verdict, and the first reason why no effect is accepted. See `explained_and_required_fractions`.
 
     A gap that is seen only along a candidate's signature counts only with an accepted effect.
     """
+    fractions = said.explained_and_required_fractions(limits)
     reasons: dict[_UnknownVerdictReason, bool] = {
         "none": not said.selected_effects,
-        "little": said._largest_explained_fraction < said.required_total_explained_fraction(limits),
-        "stand_in": bool(said.failed_transfer_checks),
+        "little": not any(part >= least for part, least in fractions),
+        "stand_in": bool(said.undetermined_effects(limits)),
     }
     reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
     if not suffice:
@@ -199,27 +196,19 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     search.record_stage_end_time("refits")
 
-    def judged(chosen: tuple[SelectedEffect, ...]) -> Judgement:
-        carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
-        if chosen:
-            last = chosen[-1].refitted_model
-            explained = _explained_fraction(nominal, last, limits)
-            carried = _check_effect_amplitude_transfer(search, last)
-            last = select.widen_refit_stds_by_model_error(chosen[-1], limits)
-            least = {f"{e.effect_label}.{e.parameter}": e.significant_disagreement_as_std for e in carried}
-            last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
-            chosen = (*chosen[:-1], replace(chosen[-1], refitted_model=last))
-        said = Judgement("", "", fits, chosen, explained, carried, 0.0, ())
-        verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
-        return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
-
-    said = judged(added)
-    if said.verdict == "unknown" and len(added) > 1:
-        # a further effect that only corrects errors of the first is no reason to doubt this one
-        alone = judged((select.effect_with_its_equivalents(added[0], nominal, fits, limits),))
-        said = alone if alone.verdict != "unknown" else said
+    carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
+    if added:
+        last = added[-1].refitted_model
+        explained = _explained_fraction(nominal, last, limits)
+        carried = _check_effect_amplitude_transfer(search, last)
+        last = select.widen_refit_stds_by_model_error(added[-1], limits)
+        least = {own.parameter: own.significant_disagreement_as_std for own in carried}
+        last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
+        added = (*added[:-1], replace(added[-1], refitted_model=last))
+    said = Judgement("", "", fits, added, explained, carried, 0.0, ())
+    verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
     search.record_stage_end_time("transfer")
-    return said
+    return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
 
 
 def _probability(said: Judgement, limits: Thresholds) -> float:
@@ -229,9 +218,12 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     """
     if not said.selected_effects:
         return 0.0
-    explained = 0.0 if said.failed_transfer_checks else said._largest_explained_fraction
-    unexplained = max(1.0 - explained, _MIN_UNEXPLAINED)
-    margin = math.log((1.0 - said.required_total_explained_fraction(limits)) / unexplained)
+    is_sized = not said.undetermined_effects(limits)
+    margin = max(
+        math.log((1.0 - least) / max(1.0 - part * is_sized, _MIN_UNEXPLAINED))
+        for part, least in said.explained_and_required_fractions(limits)
+        if math.isfinite(part)
+    )
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
@@ -260,16 +252,7 @@ def _check_effect_amplitude_transfer(
 
 
 def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics) -> list[EffectAmplitudeTransferCheck]:
-    """Comparison of the amplitudes of one effect in two fits.
-
-    Recordings that disagree by as much as the effect differs from neutral do not determine it.
-    """
-    found, away = [], []
-    for name in effect.amplitude_parameter_names:
-        own = (first.values[name], first.std[name], second.values[name], second.std[name])
-        what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
-        entry = EffectAmplitudeTransferCheck(*what, *own, effect.neutral_values[name], True)
-        least = _DISAGREEMENT_Z * entry.significant_disagreement_as_std
-        away.append(abs(entry.estimation_value - entry.neutral_value) > least)
-        found.append(entry)
-    return [replace(entry, is_consistent=any(away)) for entry in found]
+    """Comparison of the amplitudes of one effect in two fits."""
+    names = effect.amplitude_parameter_names
+    both = ((own for fit in (first, second) for own in (fit.values[name], fit.std[name])) for name in names)
+    return [EffectAmplitudeTransferCheck(effect, name, *own) for name, own in zip(names, both, strict=True)]
