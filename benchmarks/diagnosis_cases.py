@@ -260,7 +260,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
         else ", ".join(entry.effect.label for entry in finding.selected_effects) or "-",
         "why": finding.unknown_reason or "-",
         "explained": f"{100 * finding.explained_fraction:.0f} %" if finding.selected_effects else "-",
-        "apart": ", ".join(of.label for of in finding.undetermined_effects(finding.thresholds)) or "-",
+        "apart": ", ".join(finding.undetermined_sizes(finding.thresholds)) or "-",
         "not separable": rivals if finding.accepted_effects and rivals else "-",
         "where": " or ".join([finding.gap_locations[0].location, *finding.gap_locations[0].indistinguishable_from])
         if finding.gap_locations

@@ -260,7 +260,7 @@ def of(label, values, stds, effects=(SPRING,), **more):
 def test_an_effect_is_accepted_if_its_size_is_known_beside_all_that_is_left(first, second, known):
     one, other = (of("spring@elbow", {"k": value}, {"k": std}, cost=1.0) for value, std in (first, second))
     said = judgement([added(SPRING, fitted=one)], other)
-    assert said.undetermined_effects(LIMITS) == ([] if known else [SPRING])
+    assert list(said.undetermined_sizes(LIMITS)) == ([] if known else ["spring@elbow"])
     assert (said.verdict, said.unknown_reason) == (("effect", "") if known else ("unknown", "stand_in"))
     [entry] = said.transfer_checks
     assert (entry.effect, entry.parameter) == (SPRING, "spring@elbow.k")
@@ -271,9 +271,9 @@ def test_an_effect_is_accepted_if_its_size_is_known_beside_all_that_is_left(firs
 def test_one_part_of_a_vector_that_agrees_is_enough():
     stds = {"x": 1e-3, "y": 1e-3}
     one, other = (of("shift@grasp", values, stds, (SHIFT,)) for values in ({"x": 1.0, "y": 0.1}, {"x": 1.0, "y": -0.1}))
-    assert judgement([added(SHIFT, fitted=one)], other).undetermined_effects(LIMITS) == []
+    assert judgement([added(SHIFT, fitted=one)], other).undetermined_sizes(LIMITS) == {}
     far = of("shift@grasp", {"x": -1.0, "y": -0.1}, stds, (SHIFT,))
-    assert judgement([added(SHIFT, fitted=one)], far).undetermined_effects(LIMITS) == [SHIFT]
+    assert judgement([added(SHIFT, fitted=one)], far).undetermined_sizes(LIMITS).keys() == {"shift@grasp"}
 
 
 @pytest.mark.parametrize(

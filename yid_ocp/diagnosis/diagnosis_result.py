@@ -76,12 +76,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         return tuple(entry.effect for entry in self.accepted_selected_effects)
 
     @property
-    def undetermined_size_texts(self) -> list[str]:
-        """Texts with both estimates of each amplitude of the selected effects whose size is not determined."""
-        unknown = self.undetermined_effects(self.thresholds)
-        return [check.text for check in self.transfer_checks if check.effect in unknown]
-
-    @property
     def final_model(self) -> RefittedModel:
         """The model with all accepted effects, or the nominal model if there are none."""
         last = [self.nominal_model, *(entry.refitted_model for entry in self.accepted_selected_effects)][-1]
@@ -101,7 +95,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
-        reason = "; ".join(self.undetermined_size_texts)
+        reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",

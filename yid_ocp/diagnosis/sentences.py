@@ -86,10 +86,8 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
 
 def held_out_truncation_message(cut: HeldOutTruncation) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = (
-        f"Only the first {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}'"
-    )
-    return f"{used} are used, because its simulation then fails. To use more, halve problem.time_step."
+    used = f"Only {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}' are used"
+    return f"{used}, because its simulation then fails. To use more, halve problem.time_step."
 
 
 def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
@@ -176,12 +174,11 @@ def _causes(result: DiagnosisResult) -> list[str]:
     causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
-    end = (
-        f" and, at the lower end of the interval, {100 * closed:.3g} % on held-out motions (needed: {100 * goal:.3g} %)"
-    )
-    unsure = " and ".join(effect.label for effect in result.undetermined_effects(limits))
+    end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
+    sizes = result.undetermined_sizes(limits)
+    unsure = " and ".join(sizes)
     size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} ± or more from the one without effect"
-    apart = "".join(f". {text}" for text in result.undetermined_size_texts[:2])
+    apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none = "No cause is named, because"
     reasons = {
@@ -198,11 +195,10 @@ def _several_places(result: DiagnosisResult) -> str:
     scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
     best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
     alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
-    if not result.unknown_reason or len(alike) < 2:
-        return ""
-    said = f"{best[0]} is significant at several locations (p below {level / len(scores):.2g}): "
+    said = f"{''.join(best)} is significant at several locations (p below {level / max(len(scores), 1):.2g}): "
+    said += abbreviated_names_text([s.effect.location for s in alike])
     advice = "Add it there under model.effects (friction: as `yid-ocp friction` advises), and repeat `yid-ocp diagnose`"
-    return f"{said}{abbreviated_names_text([s.effect.location for s in alike])}. {advice}."
+    return f"{said}. {advice}." if result.unknown_reason and len(alike) > 1 else ""
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:

@@ -120,10 +120,11 @@ class Judgement:
         rivals, probability = tuple(names), self.probability * share
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
-    def undetermined_effects(self, limits: Thresholds) -> list[EffectBase]:
-        """List the selected effects whose size is within `min_z` stds of neutral; stds include the remaining gap."""
-        effects, last = [entry.effect for entry in self.selected_effects], self.selected_effects[-1:]
-        return [e for e in effects for own in last if not own.refitted_model.determines_size(e, limits.min_z)]
+    def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
+        """Estimates, as texts, of the selected effects within `min_z` stds (which include the gap) of neutral, by label."""
+        effects, fits = [e.effect for e in self.selected_effects], [e.refitted_model for e in self.selected_effects]
+        unsure = [own for own in effects if not fits[-1].determines_size(own, limits.min_z)]
+        return {own.label: [c.text for c in self.transfer_checks if c.effect.label == own.label] for own in unsure}
 
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
@@ -175,7 +176,7 @@ def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) 
     reasons: dict[_UnknownVerdictReason, bool] = {
         "none": not said.selected_effects,
         "little": not any(part >= least for part, least in fractions),
-        "stand_in": bool(said.undetermined_effects(limits)),
+        "stand_in": bool(said.undetermined_sizes(limits)),
     }
     reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
     if not suffice:
@@ -218,7 +219,7 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     """
     if not said.selected_effects:
         return 0.0
-    is_sized = not said.undetermined_effects(limits)
+    is_sized = not said.undetermined_sizes(limits)
     margin = max(
         math.log((1.0 - least) / max(1.0 - part * is_sized, _MIN_UNEXPLAINED))
         for part, least in said.explained_and_required_fractions(limits)
@@ -247,12 +248,8 @@ def _check_effect_amplitude_transfer(
 
     Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
     """
-    again = search.refit_on_held_out(fit)
-    return () if again is None else tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again))
-
-
-def _compare(effect: EffectBase, first: RefitStatistics, second: RefitStatistics) -> list[EffectAmplitudeTransferCheck]:
-    """Comparison of the amplitudes of one effect in two fits."""
-    names = effect.amplitude_parameter_names
-    both = ((own for fit in (first, second) for own in (fit.values[name], fit.std[name])) for name in names)
-    return [EffectAmplitudeTransferCheck(effect, name, *own) for name, own in zip(names, both, strict=True)]
+    if (again := search.refit_on_held_out(fit)) is None:
+        return ()
+    names = [(effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names]
+    both = ((fit.values[name], fit.std[name], again.values[name], again.std[name]) for _, name in names)
+    return tuple(EffectAmplitudeTransferCheck(*of, *own) for of, own in zip(names, both, strict=True))

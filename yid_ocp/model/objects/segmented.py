@@ -45,9 +45,7 @@ class _SegmentGeometry:
     ] = None
     rpy: Annotated[Vector3, OptionInfo("rest rotation relative to the parent's link or mount", "rad")] = _NO_TURN
     has_separate_twist_damping: Annotated[bool, OptionInfo("whether twists have their own damping parameter")] = False
-    values_given_as_rigidities: Annotated[
-        bool, OptionInfo("whether stiffness and damping are rigidities, which do not depend on the number of links")
-    ] = False
+    values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether its first end is clamped by a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
     has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
