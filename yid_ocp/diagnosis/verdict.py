@@ -121,7 +121,7 @@ class Judgement:
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
-        """Estimates, as texts, of the selected effects within `min_z` stds (which include the gap) of neutral, by label."""
+        """Both estimates, as texts, of the effects within `min_z` stds (which include the gap) of neutral, by label."""
         effects, fits = [e.effect for e in self.selected_effects], [e.refitted_model for e in self.selected_effects]
         unsure = [own for own in effects if not fits[-1].determines_size(own, limits.min_z)]
         return {own.label: [c.text for c in self.transfer_checks if c.effect.label == own.label] for own in unsure}
