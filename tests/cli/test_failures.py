@@ -42,7 +42,7 @@ def test_a_rollout_that_fails_leaves_reason_and_best_point(carried_out, pendulum
     assert result["parameters"]["shoulder.stiffness"]["std"] is None
     assert any("std" in note for note in result["notes"])
     assert "could not be predicted" in done.out
-    assert "found" not in done.out.split("Held-out")[0]
+    assert "found" not in done.out.split("The held-out")[0]
     assert (done.folder / "report.html").is_file()
 
 

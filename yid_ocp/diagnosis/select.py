@@ -23,7 +23,7 @@ _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' 
 _MIN_CHI2_FRACTION = 0.05**2
 _LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds that simulated cases show
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
-_MIN_FURTHER_CLOSURE = 0.4  # of what is left, by an effect that is not the only one
+_MIN_FURTHER_PART = 0.4  # of the gap that other effects leave, to be explained by a further one
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
@@ -170,11 +170,13 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
 
-    Beside other effects, they must also close a good part of what is left: less may be the others' errors.
+    Beside other effects, they must also explain a good part of what is left. Less may be errors of the others.
     """
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = chi2_per_sample_decrease_and_std_error(before, after)
-    is_clear = gained > max(error, _MIN_FURTHER_CLOSURE * before.excess_chi2_per_sample * bool(without.effects))
+    excess = max(2 * without.cost - without.residual_count, 1.0), max(before.excess_chi2_per_sample, 1e-9)
+    part = max(2 * (without.cost - fit.cost) / excess[0], gained / excess[1])
+    is_clear = gained > error and part > _MIN_FURTHER_PART * bool(without.effects)
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
     # the amplitudes of an effect together are at least as significant as one amplitude at `min_z` standard deviations
