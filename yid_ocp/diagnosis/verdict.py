@@ -149,7 +149,7 @@ class Judgement:
     def required_total_fraction(self, of_one: float) -> float:
         """Compute the fraction of the gap that the selected effects must explain if one must explain `of_one`.
 
-        For k independent effects (every local one, every other kind) it is 1 - (1 - `of_one`)^k, as each explains a part.
+        For k independent effects (every local one, every other kind) it is 1 - (1 - `of_one`)^k: each explains a part.
         """
         effects = (entry.effect for entry in self.selected_effects)
         independent = {effect.label if effect.is_local else effect.kind for effect in effects}
