@@ -298,7 +298,7 @@ def test_a_search_can_be_stopped_between_weights():
 
 @pytest.mark.parametrize(
     ("slope", "target", "tried"),
-    [(20.0, 2.5, False), (2.0, 2.5, True), (1e-4, 2.5, False), (1e4, 0.01, True), (1e4, 0.03, False)],
+    [(20.0, 2.5, False), (0.12, 2.5, True), (0.08, 2.5, False), (1e4, 0.01, True), (1e4, 0.03, False)],
     ids=["well known", "loosely known", "not informed", "nearly vanished", "small and well known"],
 )
 def test_beside_noise_that_drives_the_motion_doubtful_estimates_have_another_start(slope, target, tried):

@@ -20,6 +20,7 @@ from yid_ocp.errors import ConfigError, YidError, import_optional
 from yid_ocp.inference import linearized_residual
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
+    MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
     EstimateChecksBeyondFit,
     GoodnessOfFit,
@@ -260,7 +261,7 @@ _INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
 # If all of these fits are poor, other multiples are predicted. The best one is a start where it beats every fit.
 _FAR_FACTORS = (1e-2, 3e-2, 0.1, 0.3, 30.0, 100.0, 300.0, 1000.0)
 # With process noise, a wrong minimum can have a chi2 per degree of freedom of only 1.03. Another start is tried if a
-# relative std exceeds the first number, or the ratio of a value to its initial value falls below the second.
+# relative std is between the first number and that of no information, or if value over start is below the second.
 _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
 # If the arm folds the object for a moment, minima can be close together. If the model does not explain the recording,
 # the best fit is multiplied by these factors and tried again: a stiffer object folds less.
@@ -305,8 +306,7 @@ def fit_problem(
     verdicts : bool
         Whether loosely known parameters are evaluated at the ends of their intervals. If not, verdicts are provisional.
     """
-    # small matrices: threads of the linear algebra library cost more than they save
-    with threadpoolctl.threadpool_limits(1):
+    with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         if initial_unknowns is None:
             start = unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
         else:
@@ -568,7 +568,7 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
     if not fit.evaluation.ok or fit.evaluation.jacobian is None:
         return np.zeros(len(x), bool)
     std = np.sqrt(np.maximum(np.diag(unknowns_covariance_and_reduced_chi2(fit.weighted, fit.evaluation)[0]), 0.0))
-    loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < 100 * np.abs(first))
+    loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < MAX_WEAK_RELATIVE_STD * np.abs([x, first]).max(axis=0))
     return fit.weighted.positive_unknowns_mask & (loose | (x < _COLLAPSED_FRACTION * first))
 
 
