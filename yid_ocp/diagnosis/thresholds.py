@@ -53,7 +53,7 @@ class Thresholds:
         OptionInfo("fraction of the fitted gap that one effect must explain, if its closure is too small"),
     ] = 0.75
     min_closure: Annotated[
-        float, Ge(0), Le(1), OptionInfo("lower end of the closure's 95 % interval that one effect must reach otherwise")
+        float, Ge(0), Lt(1), OptionInfo("lower end of the closure's 95 % interval that one effect must reach otherwise")
     ] = 0.4
     # where the gap lies, and when
     max_event_duration: Annotated[float, Gt(0), OptionInfo("largest duration of an event", "s")] = 1.0

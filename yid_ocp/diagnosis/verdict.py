@@ -218,12 +218,10 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     """
     if not said.selected_effects:
         return 0.0
-    is_sized = not said.undetermined_sizes(limits)
-    margin = max(
-        math.log((1.0 - least) / max(1.0 - part * is_sized, _MIN_UNEXPLAINED))
-        for part, least in said.explained_and_required_fractions(limits)
-        if math.isfinite(part)
-    )
+    (fitted, least), (closed, goal) = said.explained_and_required_fractions(limits)
+    left = min(1.0 - fitted, (1.0 - closed) * (1.0 - least) / (1.0 - goal))  # the first if there is no closure
+    unexplained = 1.0 if said.undetermined_sizes(limits) else max(left, _MIN_UNEXPLAINED)
+    margin = math.log((1.0 - least) / unexplained)
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
 
 
