@@ -213,8 +213,7 @@ def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: byte
 
 
 def test_a_table_without_a_header(tmp_path: Path) -> None:
-    path = table(tmp_path, "0,0.1,5\n1,0.2,6\n")
-    columns = {"1": "t", "2": "position:a", "3": "effort:a"}
+    path, columns = table(tmp_path, "0,0.1,5\n1,0.2,6\n"), {"1": "t", "2": "position:a", "3": "effort:a"}
     joints = joints_of(read_any(path, has_header=False, column_meanings=columns))
     assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
     assert np.array_equal(joints.values_by_channel["effort"][:, 0], [5, 6])
@@ -323,6 +322,8 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     assert read_any(path, units={"points": "cm"}).points[0].position[0, 0] == pytest.approx([1, 2, 3])
     # a motor's current is no external effort
     assert parse_quantity_units(["A", "ms"]) == {"effort": "A", "t": "ms"}
+    with pytest.raises(DataError, match="allowed: s, ms, us, ns, m, cm, mm, rad, deg, rev, rad/s"):
+        parse_quantity_units(["degree"])
     # units in a row of their own, numbers of the rows, and a row that a spreadsheet left
     path = table(tmp_path, ",Time,q1,p_x,p_y,p_z\n,(ms),°,mm,mm,mm\n0,0,90,100,200,300\n1,10,45,100,200,300\n,,,,,\n")
     assert preview_file(path).reader_options == {}

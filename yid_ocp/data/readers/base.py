@@ -73,7 +73,8 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
-            said = unknown_name_error_arguments(word, chain(*_TO_SI.values()), "write for example --units deg,mm")
+            every = dict.fromkeys(chain(*_TO_SI.values()))  # metres are units of two quantities
+            said = unknown_name_error_arguments(word, every, "write for example --units deg,mm")
             raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
         own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or word not in MOTOR_CURRENT_UNITS)]
         for quantity in own:
@@ -219,9 +220,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
 
 def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     """Guess the units of values that cannot be in SI units. Returns units by quantity, and the reasons as sentences."""
-    units: dict[str, str] = {}
-    notes = []
-    joints = recording.joints
+    units, notes, joints = dict[str, str](), list[str](), recording.joints
     if joints is not None and joints.position.size:
         widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
         if widest > _MAX_PLAUSIBLE_VALUES["position"]:
