@@ -329,8 +329,8 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
         hint = "correct the <inertia> of the link: a wrong sign, or ixy in place of ixx, are usual causes"
         raise ModelError(what, where=where, allowed="principal moments of 0 or more", hint=hint)
     if least + middle < (1 - _PRINCIPAL_MOMENT_RTOL) * most:
-        what = "%s: link '%s' has principal moments of inertia of %s kg m^2, but in any body the largest is at most "
-        log.warning(what + "the sum of the others. They are used unchanged. Check <inertia>", where, link, values)
+        what = f"{Path(where).name}: link '{link}' has principal moments of inertia of {values} kg m^2, but in any body"
+        log.warning("%s the largest is at most the sum of the others. They are used unchanged. Check <inertia>", what)
 
 
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
@@ -349,7 +349,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
             continue
         if wanted is None or mimic.joint in wanted:
             what = "%s: joint '%s' follows '%s' (mimic). Couplings are not modelled, so '%s' does not move in the model"
-            log.warning(what, where, name, mimic.joint, name)
+            log.warning(what, Path(where).name, name, mimic.joint, name)
         locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
     return set(following)
 
