@@ -171,8 +171,7 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
 
 
 SERVO_POSTURE = {"pan": 0.2, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
-JOINTS = tuple(SERVO_POSTURE)
-SERVO = {"servo_gain": 40.0, "servo_damping": 2.0, "servo_delay": 0.035}
+JOINTS, SERVO = tuple(SERVO_POSTURE), {"servo_gain": 40.0, "servo_damping": 2.0, "servo_delay": 0.035}
 VALUES = {f"{joint}.{name}": value for joint in JOINTS for name, value in SERVO.items()}
 
 
@@ -235,8 +234,7 @@ def test_both_engines_move_a_direct_current_motor_alike() -> None:
     servos = {kind: ServoModelOptions(motor=MotorKindAndPreset(kind)) for kind in ("dc", "ideal")}
     systems = {kind: moved_by(own, point_frames=[]) for kind, own in servos.items()}
     limited = ("servo_saturation", "lift", {"limit": 1.3})
-    made = played(systems["dc"], InjectedEffect(*limited))
-    apart = {}
+    made, apart = played(systems["dc"], InjectedEffect(*limited)), {}
     for kind, system in systems.items():
         own = system.with_effects([make_effect(*limited[:2], system, limited[2])])
         apart[kind] = np.abs(evaluated(own, made)[1] - made.joints.position)[:, JOINTS.index("lift")].max()
@@ -296,12 +294,19 @@ def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_lim
         mujoco_xml(limited, values)
 
 
-def test_an_exported_model_replays_its_commands(servo_arm: System, recording: Recording) -> None:
+def test_an_exported_model_replays_its_commands(servo_arm: System, recording: Recording, tmp_path, monkeypatch) -> None:
     nominal = dict(zip(servo_arm.parameters.names, servo_arm.parameters.vector(VALUES), strict=True))
 
-    def error(**changes: float) -> float:
+    def error(own: Recording = recording, **changes: float) -> float:
         text = mujoco_xml(servo_arm, nominal | changes, emulate=True, actuators=True)
-        return replay_mismatch_by_channel(text, servo_arm, recording)["joints.position"].rmse
+        return replay_mismatch_by_channel(text, servo_arm, own)["joints.position"].rmse
 
     assert error() < 1e-3
     assert error(**{"pan.servo_gain": 10.0}) > 5 * error()
+    # MuJoCo resets a state that diverges, goes on, and leaves a log where it is
+    monkeypatch.chdir(tmp_path)
+    wild = np.array(recording.joints.position_command)
+    wild[25] = 9e9
+    joints = replace(recording.joints, position_command=wild)
+    with pytest.raises(ModelError, match="the replay in MuJoCo diverged"):
+        error(replace(recording, joints=joints), **{"pan.servo_torque_limit": 1e12})

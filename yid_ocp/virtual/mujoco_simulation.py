@@ -467,6 +467,7 @@ class _Played:
     t: Array
     values: Array
     points: Array
+    has_diverged: bool
 
 
 def _step_times(scene: MujocoModelAndState, end: float) -> Array:
@@ -482,11 +483,10 @@ def _played(scene: MujocoModelAndState, end: float, control: Callable[[int, floa
     for k, t in enumerate(times):
         mujoco.mj_kinematics(model, data)
         values[k], points[k] = data.qpos[at], data.site_xpos[scene.point_site_ids]
-        own = control(k, t)
-        if own is not None:
+        if (own := control(k, t)) is not None:
             values[k] = own
         mujoco.mj_step(model, data)
-    return _Played(times, values, points)
+    return _Played(times, values, points, _lost(scene) or not (np.isfinite(values).all() and np.isfinite(points).all()))
 
 
 def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | None) -> _Played:
@@ -528,7 +528,7 @@ def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: A
 def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
+    if played.has_diverged:
         what, hint = "the replay in MuJoCo diverged", "set a smaller `timestep` under `option` in the MJCF text"
         raise ModelError(what, where=f"recording '{recording.name}'", allowed="finite positions and efforts", hint=hint)
     found: dict[str, ReplayErrorAgainstRecording] = {}
