@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from small_problems import pendulum_step
@@ -26,8 +27,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.model_functions import NodeStateValues
 
-STD = 2e-3
-STEPS = 60
+STD, STEPS = 2e-3, 60
 
 
 def camera(t, points):
@@ -72,11 +72,9 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     found, _, _ = judged(hanging(gravity=9.81 * along, turned=turned))
     twist, bend = found["T1.twist"], found["T1.bend"]
     assert twist.rows == tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
-    assert twist.observable_rows == ()
-    assert twist.most_sensitive_sensor == ""
+    assert (twist.observable_rows, twist.most_sensitive_sensor) == ((), "")
     assert (twist.max_change_from_rest < 1e-6, twist.seconds) == (True, pytest.approx(0.6))
-    assert bend.observable_rows == bend.rows
-    assert bend.most_sensitive_sensor == "points_camera"
+    assert (bend.observable_rows, bend.most_sensitive_sensor) == (bend.rows, "points_camera")
     # a rod that hangs straight does not bend: its stiffness moves nothing either
     assert bend.max_change_from_rest < 1e-6
 
@@ -85,8 +83,7 @@ def test_the_twist_of_a_bent_rod_is_seen_but_not_its_stiffness(hanging):
     """Pulled sideways it bends in one plane, out of which a twist turns it; at rest there is no twist to resist."""
     found, _, _ = judged(hanging(gravity=(3.0, 0.0, -9.0)))
     twist, bend = found["T1.twist"], found["T1.bend"]
-    assert twist.observable_rows == twist.rows
-    assert twist.most_sensitive_sensor == "points_camera"
+    assert (twist.observable_rows, twist.most_sensitive_sensor) == (twist.rows, "points_camera")
     assert twist.max_change_from_rest < 1e-6
     assert bend.max_change_from_rest > 0.1
 
@@ -110,8 +107,7 @@ def swinging(request, urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     how = {request.param: ["shoulder"], "damping": 0.1, "point_frames": ["tip"]}
     system = System.build(robot, springs={"elbow": StiffnessAndRest(3.0, 0.4)}, **how)
-    step = compile_step(system, 0.01, use_compiler=False)
-    t = 0.01 * np.arange(STEPS + 1)
+    step, t = compile_step(system, 0.01, use_compiler=False), 0.01 * np.arange(STEPS + 1)
     effort = {"effort": np.zeros((len(t), 1)), "effort_kind": "command", "effort_std": 0.05}
     joints = JointGroup(("shoulder",), t, np.full((len(t), 1), 0.3), position_std=1e-3, **effort)
     options = ProblemOptions(path_cutoff=math.inf, sensors={"joints.effort": SensorOptions(std=0.05)})
@@ -122,8 +118,7 @@ def swinging(request, urdf_folder):
 def rolled_out(problem, rest, theta):
     """Whitened readings along a rollout from the rest under the filter's first gain, shape (sensor, node, output)."""
     step, episode = problem.step, problem.episodes[0]
-    system = step.system
-    torque = np.tile(rest.holding_torque, (STEPS + 1, 1))
+    system, torque = step.system, np.tile(rest.holding_torque, (STEPS + 1, 1))
     path = np.tile(episode.initial_known_coordinates[len(system.driven) :], (STEPS + 2, 1))
     feedback = episode.tracking_feedback
     if feedback is not None:
@@ -133,8 +128,7 @@ def rolled_out(problem, rest, theta):
     assert rollout.status.is_converged
     found = []
     for samples in episode.measurements:
-        std = np.nanmedian(samples.std, axis=0)
-        effort = np.zeros((STEPS + 1, step.sizes["n"]))
+        std, effort = np.nanmedian(samples.std, axis=0), np.zeros((STEPS + 1, step.sizes["n"]))
         effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
         values = NodeStateValues.from_trajectory(step, rollout.state[:-1], effort)
         found.append(problem.model_functions.compiled_sensor_function(samples.sensor)(values, theta).output / std)
@@ -143,9 +137,8 @@ def rolled_out(problem, rest, theta):
 
 def moved_by(problem, rest, name):
     """The largest change of a whitened reading by a parameter, in differences of rollouts."""
-    ends, change = [], 1e-5 * np.eye(len(problem.theta))[problem.system.parameters.index(name)]
-    for sign in (1, -1):
-        ends.append(rolled_out(problem, rest, problem.theta + sign * change))
+    change = 1e-5 * np.eye(len(problem.theta))[problem.system.parameters.index(name)]
+    ends = [rolled_out(problem, rest, problem.theta + sign * change) for sign in (1, -1)]
     return max(np.max(np.abs(up - down)) / 2e-5 for up, down in zip(*ends, strict=True))
 
 
@@ -153,9 +146,8 @@ def moved_by(problem, rest, name):
 def test_what_a_parameter_moves_is_what_rollouts_say(swinging):
     found, rest, _ = judged(swinging)
     for name in ("elbow.stiffness", "elbow.rest", "elbow.mass", "shoulder.mass", "elbow.damping"):
-        assert found[name].max_change_from_rest == pytest.approx(moved_by(swinging, rest, name), rel=2e-3, abs=2e-4), (
-            name
-        )
+        expected = pytest.approx(moved_by(swinging, rest, name), rel=2e-3, abs=2e-4)
+        assert found[name].max_change_from_rest == expected, name
         assert found[name].unit == swinging.system.parameters[name].unit
 
 
@@ -163,16 +155,14 @@ def test_what_a_parameter_moves_is_what_rollouts_say(swinging):
 def test_efforts_of_joints_moved_as_measured_feel_their_own_rows(swinging):
     found, _, _ = judged(swinging)
     damping = found["shoulder.damping"]
-    assert damping.rows == ("del[shoulder]", "p1[shoulder]")
-    assert damping.observable_rows == damping.rows
+    assert damping.observable_rows == damping.rows == ("del[shoulder]", "p1[shoulder]")
     if swinging.system.prescribed:
         assert damping.most_sensitive_sensor == "joints.effort"
 
 
 def test_without_sensors_only_rows_are_said(hanging):
     step = hanging().step
-    symbols = NamedStepEquations.from_equations(step.equations)
-    theta = step.system.parameters.vector()
+    symbols, theta = NamedStepEquations.from_equations(step.equations), step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, theta, np.zeros(0))
     found = {e.parameter: e for e in equations_and_sensors_per_parameter(step, symbols, None, rest.state, theta, rows)}
@@ -254,6 +244,11 @@ def test_what_cannot_swing_says_so(urdf_folder):
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
     assert all(fact in found.message for fact in ("none, because", "driven or prescribed")), found.message
+    # an equation across the plane in which the pendulum moves is redundant
+    tip = Grasp("hand", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 0.0, 0.3])))
+    system = System.build(robot, prescribed=["shoulder"], grasps=[tip], point_frames=["tip"])
+    found = step_map_natural_frequencies(system, {"shoulder": 0.0}, system.parameters.vector(), H)
+    assert "redundant grasps" in found.message
 
 
 @pytest.fixture(scope="module")

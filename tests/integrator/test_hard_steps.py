@@ -74,14 +74,13 @@ def out_of_reach(folder):
 
 
 def redundant(folder):
-    grasps = [Grasp(name, "floor", "disc") for name in ("one", "two")]
-    return System.build(read_urdf(folder / "turntable.urdf"), grasps=grasps)
+    grasps = tuple(Grasp(name, "floor", "disc") for name in ("one", "two"))
+    return replace(System.build(read_urdf(folder / "turntable.urdf")), grasps=grasps)
 
 
 CLAMP_TURNED = np.array([-0.2, 0.1, -0.2, 0.2, 0.2, 0.2])
 PULLED_BACK = np.array([0.0, 0.0, -1e-4, 0.0, 0.0, 0.0])
-HANGING = np.array([0.3, -0.2])
-CODE = NewtonStatusCode
+HANGING, CODE = np.array([0.3, -0.2]), NewtonStatusCode
 CASES: dict[str, Callable[..., Hard]] = {
     "fast_pendulum": lambda p, f: Hard(pendulum(f), HANGING, 0.2, p=np.array([30.0, 20.0]), torque=5.0, damped=True),
     "closed_loop_moved_far": lambda p, f: Hard(*p.closed_loop(f), 0.05, torque=60.0, moved=1.0, steps=2, damped=True),

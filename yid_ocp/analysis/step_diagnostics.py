@@ -292,8 +292,7 @@ def _inverse_sparsity(mask: BoolArray) -> BoolArray:
 
 
 def _times(a: BoolArray, b: BoolArray) -> BoolArray:
-    product: BoolArray = (a.astype(np.float32) @ b.astype(np.float32)) > 0
-    return product
+    return np.asarray((a.astype(np.float32) @ b.astype(np.float32)) > 0)
 
 
 _DAMPING_PARAMETERS = ("damping", "twist_damping")
@@ -335,18 +334,22 @@ def step_map_natural_frequencies(
         return UndampedStepMapFrequencies(np.zeros(0), message=rest.message)
     damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
     undamped = np.where(damps, 0.0, theta)
-    angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
+    without, values = (_eigenvalues(step, rest, known, own) for own in (undamped, theta))
+    if without is None or values is None:
+        said = "not computed, because a step's equations are singular. Look for redundant grasps or massless links"
+        return UndampedStepMapFrequencies(np.zeros(0), message=said)
+    angles = np.sort(np.angle(without))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
-    growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
-    return UndampedStepMapFrequencies(turning / (2 * math.pi * time_step), growing)
+    return UndampedStepMapFrequencies(turning / (2 * math.pi * time_step), int(np.sum(np.abs(values) > 1 + 1e-6)))
 
 
-def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array:
-    """Return the eigenvalues of the state's Jacobian A at an equilibrium, without those of the constraints."""
+def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> Array | None:
+    """Return the eigenvalues of A at an equilibrium, without those of the constraints. None if A is not finite."""
     n = step.system.n_coordinates
     q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
     a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
-    free = np.array(step.system.unprescribed_coordinate_indices)
-    rows = np.concatenate([free, n + free])
+    if not np.isfinite(a).all():
+        return None
+    rows = np.add.outer([0, n], step.system.unprescribed_coordinate_indices).ravel()
     values: Array = np.linalg.eigvals(a[np.ix_(rows, rows)])
     return values[np.abs(values) > 0.2]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 import casadi as ca
@@ -280,7 +281,7 @@ class System(ReprMixin):
     ) -> System:
         """Build a system from the robot `mechanism` (None: no robot), effects, and objects and other `options`.
 
-        Raises `ModelError` if a name is unknown or repeated, there is no joint, or a joint is driven and prescribed.
+        Raises `ModelError` for unknown or repeated names, no joint, a driven and prescribed joint, or equal grasps.
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
@@ -295,8 +296,7 @@ class System(ReprMixin):
             for joint, size in wanted.items()
             if tree.joint_index(joint) >= 0  # raises `ModelError` if there is no such joint
         }
-        entries = list(dampers.values())
-        elastic: list[ElasticJoint] = []
+        entries, elastic, segments = list(dampers.values()), list[ElasticJoint](), list[SingleSegmentLayout]()
         for joint, spring in options.get("springs", {}).items():
             stiffness, rest = servos_and_springs.stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
@@ -304,7 +304,6 @@ class System(ReprMixin):
         moved, own = ({}, []) if servos is None else servos_and_springs.build_joint_servos(tree, driven, servos)
         if servos is not None and servos.has_gravity_compensation:
             tree = tree.with_gravity_fraction(ca.SX(0))
-        segments: list[SingleSegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
             tree = tree.with_attached_mechanism(item.mechanism, frame, placement)
             elastic += item.elastic_joints
@@ -313,9 +312,8 @@ class System(ReprMixin):
         seen = tuple((name for name in tree.frames if name.startswith("w_")) if seen is None else seen)
         _check_names(tree, grasps, driven, prescribed, seen)
         parameters = tree.parameters.with_added(entries, own)
-        coefficients = {joint: parameter.symbol for joint, parameter in dampers.items()}
-        known = (grasps, driven, moved, prescribed, ca.SX(ca.DM(gravity)))
-        system = System(tree, parameters, tuple(elastic), coefficients, *known, point_frames=seen)
+        known = ({joint: p.symbol for joint, p in dampers.items()}, grasps, driven, moved, prescribed)
+        system = System(tree, parameters, tuple(elastic), *known, ca.SX(ca.DM(gravity)), point_frames=seen)
         integrals = [_ServoIntegral.of_joint(name) for name, servo in moved.items() if not servo.integral.is_zero()]
         return replace(system, segment_layouts=tuple(segments)).with_effects([*integrals, *effects])
 
@@ -456,7 +454,7 @@ class System(ReprMixin):
 def _check_names(
     tree: Mechanism, grasps: Sequence[Grasp], driven: Sequence[str], prescribed: Sequence[str], points: Sequence[str]
 ) -> None:
-    """Raise `ModelError` for a name that does not exist or is used twice, or a tree without joints."""
+    """Raise `ModelError` for a wrong or repeated name, for a tree without joints, and for two equal grasps."""
     if not tree.joints:
         what, hint = "the model has no joint", "set model.robot (with movable joints), model.object, or both"
         raise ModelError(what, where=f"model '{tree.name}'", allowed="one joint or more", hint=hint)
@@ -472,6 +470,11 @@ def _check_names(
         raise ModelError(what, where="driven and prescribed joints", allowed="one of the two", hint=hint)
     for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
         tree.frame(frame)
+    for one, two in combinations(filter(lambda grasp: grasp.compliance.is_zero(), grasps), 2):
+        if {one.holder_frame, one.held_frame} == {two.holder_frame, two.held_frame}:
+            frames = f"the same two frames, {two.holder_frame} and {two.held_frame}"
+            what, hint = f"the grasps '{one.name}' and '{two.name}' constrain {frames}", f"remove '{two.name}'"
+            raise ModelError(what, where="grasps", allowed="one rigid grasp for two frames", hint=hint)
 
 
 def six_joint_floating_mechanism(name: str) -> Mechanism:
