@@ -38,10 +38,7 @@ from yid_ocp.model.objects.cable import (
     read_vertex_positions_by_name,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.predictions import (
-    naive_cable_predictions,
-    recorded_point_positions,
-)
+from yid_ocp.problem.predictions import naive_cable_predictions
 from yid_ocp.solvers import GaussNewton, fit_problem
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "deft"
@@ -131,7 +128,7 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
 
 def baselines(recording: Recording, cable: CableVertices) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.unclamped_vertex_names, recorded_point_positions(recording, cable.unclamped_vertex_names)
+    free, measured = cable.unclamped_vertex_names, recording.point_positions(cable.unclamped_vertex_names)
     predictions = naive_cable_predictions(recording, cable, free, cable.clamped_vertex_names)
     return {name: _position_rmse(predicted, measured) for name, predicted in predictions.items()}
 

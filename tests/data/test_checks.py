@@ -22,10 +22,8 @@ STD = 1e-4
 
 def made(seed: int = 1, duration: float = 8.0, rate: float = 100.0, **more) -> Recording:
     """Three joints in motion with noise, velocities and efforts, and a point that a slow camera sees."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(duration * rate) + 1) / rate
-    phase = rng.uniform(0, 6, 3)
-    wave = 2 * np.pi * np.array([0.3, 0.5, 0.7])
+    rng, t = np.random.default_rng(seed), np.arange(round(duration * rate) + 1) / rate
+    phase, wave = rng.uniform(0, 6, 3), 2 * np.pi * np.array([0.3, 0.5, 0.7])
     angle = 0.4 * np.sin(wave * t[:, None] + phase)
     rate_of = 0.4 * wave * np.cos(wave * t[:, None] + phase)
     effort = 5 * np.sin(0.7 * wave * t[:, None]) + 0.05 * rng.standard_normal(angle.shape)
@@ -218,8 +216,7 @@ def encoder_counts_per_turn(seed: int, n: int = 3000) -> Recording:
     """A slow motion of one joint, read to a 4096th of a turn at uneven times."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(0.0053 + 0.0005 * rng.uniform(-1, 1, n))
-    angle = np.sin(0.7 * t + seed) + 0.3 * np.sin(1.9 * t)
-    step = 2 * np.pi / 4096
+    angle, step = np.sin(0.7 * t + seed) + 0.3 * np.sin(1.9 * t), 2 * np.pi / 4096
     return Recording(JointGroup(("a",), t - t[0], step * np.rint(angle / step)[:, None]), name=f"run_{seed}")
 
 
@@ -308,6 +305,11 @@ def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
     recordings = [stretched([1.0, 2.0, np.nan]), stretched([5.0]), stretched([3.0, 3.0])]
     assert typical_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
     assert typical_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
+    # between points of two groups at the times of the slower one, where the other is interpolated
+    slow = PointGroup("slow", ("c",), [0.5, 0.75, 7.0], 4 * np.eye(3)[:, None])
+    two = Recording(points=(*stretched([1.0, 2.0, 3.0, 4.0]).points, slow))
+    expected = (2.5 + np.hypot(1.75, 4.0)) / 2  # of b at 1.5 and 1.75 from c at 4 along x and along y
+    assert typical_point_pair_distances([("b", "c")], [two])["b", "c"] == pytest.approx(expected)
     # one that never shows an edge does not count
     hidden, seen = stretched([np.nan]), stretched([2.0])
     assert typical_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}

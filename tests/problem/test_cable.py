@@ -32,8 +32,7 @@ UNDEFORMED = {
     "c1": (0.26, 0.07, 0.02 * np.sin(3)),
     "c2": (0.28, 0.14, 0.02 * np.sin(3) + 0.02),
 }
-PERIOD = 0.01
-TRUTH = {"parent.bend": 2.0e-3, "parent.damping": 3e-4, "c.bend": 4.0e-3, "clamp_start.roll": 0.3}
+PERIOD, TRUTH = 0.01, {"parent.bend": 2.0e-3, "parent.damping": 3e-4, "c.bend": 4.0e-3, "clamp_start.roll": 0.3}
 
 
 def line(at, towards, length):
@@ -98,13 +97,11 @@ def twin(cable, clamps):
         has_edge_lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)
-    system = clamped_cable_system(
-        typical_point_pair_distances(cable.edge_vertex_names, [as_recording(cable, t, {})]), cable, options
-    )
+    lengths = typical_point_pair_distances(cable.edge_vertex_names, [as_recording(cable, t, {})])
+    system = clamped_cable_system(lengths, cable, options)
     step = compile_step(system, PERIOD)
-    path = prescribed_coordinates_at_nodes(
-        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), ZeroPhaseLowPassFilter(np.inf), cable.clamp_pose_point_names
-    )
+    grid, low_pass = TimeGrid(0.0, PERIOD, len(t) - 1), ZeroPhaseLowPassFilter(np.inf)
+    path = prescribed_coordinates_at_nodes(stub, system, grid, low_pass, cable.clamp_pose_point_names)
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)
     assert rest.is_converged, rest.message
@@ -189,8 +186,7 @@ def test_a_simulated_cable_keeps_what_its_clamps_were_seen_to_do(twin_options, c
     step, options, recording = twin
     [group] = recording.points
     other = replace(group, name="zero", names=tuple(f"x_{name}" for name in group.names))
-    source = replace(recording, points=(other, group))
-    settings = twin_options([recording], options)
+    source, settings = replace(recording, points=(other, group)), twin_options([recording], options)
     settings = replace(settings, sensors={**settings.sensors, "zero": SensorOptions(use=False)})
     problem = EstimationProblem(step, [source], ("parent.bend",), settings)
     made = problem.simulate_synthetic_recording(TRUTH, seed=0)
@@ -211,9 +207,7 @@ def test_edges_are_as_long_as_measured(cable):
     assert lengths["c1", "c2"] == pytest.approx(expected)
     values = length_parameters_from_edges(cable, typical_point_pair_distances(cable.edge_vertex_names, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
-    assert set(values) <= set(
-        clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable).parameters.names
-    )
+    assert set(values) <= set(clamped_cable_system(lengths, cable).parameters.names)
 
 
 @pytest.mark.parametrize(
@@ -247,11 +241,8 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
         pytest.skip(f"the recordings are not there: {folder}")
     cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory_fraction=0.75)
-    step = compile_step(
-        clamped_cable_system(typical_point_pair_distances(cable.edge_vertex_names, [recording]), cable, options),
-        PERIOD,
-        use_compiler=False,
-    )
+    lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording])
+    step = compile_step(clamped_cable_system(lengths, cable, options), PERIOD, use_compiler=False)
     settings = replace(real.cable_options(cable, [recording], options), duration=0.5)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)
     errors = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.unclamped_vertex_names)

@@ -12,12 +12,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.predictions import (
-    _noisy,
-    naive_cable_predictions,
-    recorded_point_positions,
-    rmse_unit_count_dicts_by_channel,
-)
+from yid_ocp.problem.predictions import _noisy, naive_cable_predictions, rmse_unit_count_dicts_by_channel
 
 FREE = ["elbow.stiffness", "elbow.damping"]
 
@@ -35,8 +30,7 @@ def test_what_is_simulated_is_what_is_found(problem):
     assert {name: made.true_parameters[name] for name in FREE} == truth
     assert np.array_equal(made.points[0].t, problem.episodes[0].recording.points[0].t)
     again = EstimationProblem(problem.step, [made], FREE, problem.options)
-    solution = yid.solve(again)
-    at_truth = again.evaluate(again.pack_unknowns(truth), derivatives=False)
+    solution, at_truth = yid.solve(again), again.evaluate(again.pack_unknowns(truth), derivatives=False)
     assert np.abs(at_truth.residual[again.residual_rows.data]).max() < 1e-9
     for name, value in truth.items():
         # but for the weak prior
@@ -171,8 +165,7 @@ def test_a_frame_has_every_parameter_and_its_interval(solution, monkeypatch):
     assert set(frame.index) == set(solution.parameters)
     assert list(frame.columns) == ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
     for name, entry in solution.parameters.items():
-        row = frame.loc[name]
-        own = math.nan if entry.verdict == "not_identifiable" else entry.value
+        row, own = frame.loc[name], math.nan if entry.verdict == "not_identifiable" else entry.value
         assert repr(entry).startswith("<ParameterEstimate: –") == math.isnan(own)
         assert (row["value"], row["std"], row["verdict"]) == (pytest.approx(own, nan_ok=True), entry.std, entry.verdict)
         if entry.interval is None:
@@ -208,7 +201,7 @@ CABLE = CableVertices(PARENT, CHILDREN, dict.fromkeys(NAMES, (0.0, 0.0, 0.0)))
 
 def test_stay_repeats_the_last_given_frame(recording):
     predicted = naive_cable_predictions(recording, CABLE, NAMES)["stays"]
-    np.testing.assert_array_equal(predicted[:2], recorded_point_positions(recording, NAMES)[:2])
+    np.testing.assert_array_equal(predicted[:2], recording.point_positions(NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 
@@ -240,6 +233,15 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     assert set(found) == {"stays", "moves_with_clamps", "linear_carry"}
     for name, predicted in found.items():
         np.testing.assert_array_equal(predicted[2:], expected[name][2:])
+
+
+def test_points_of_another_group_are_taken_at_the_times_of_the_predicted_ones(recording):
+    [group] = recording.points
+    fast = PointGroup("points_p", NAMES[:5], group.t, group.position[:, :5])
+    slow = PointGroup("points_c", NAMES[5:], group.t[::2], group.position[::2, 5:])
+    found = naive_cable_predictions(Recording(points=(fast, slow), name="two"), CABLE, NAMES[5:])
+    np.testing.assert_allclose(found["moves_with_clamps"][-1, :, 2], 1e-3 * 8)
+    np.testing.assert_allclose(found["linear_carry"][-1, :, 2] / 8e-3, 1.8, rtol=1e-3)
 
 
 def test_what_cannot_be_predicted_is_said(recording):
@@ -294,8 +296,7 @@ def test_encoders_beside_points_of_the_arm_are_refused(driven):
 
 @pytest.mark.parametrize("said", [0.02, None])
 def test_noise_that_nobody_states_is_read_from_the_recording(driven, said, caplog):
-    step, made = driven(400)
-    rng = np.random.default_rng(1)
+    (step, made), rng = driven(400), np.random.default_rng(1)
     noisy = made.joints.effort + 0.02 * rng.standard_normal(made.joints.effort.shape)
     with caplog.at_level("WARNING"):
         problem = sprung(step, replace(made, joints=replace(made.joints, effort=noisy, effort_std=said)))
@@ -324,8 +325,7 @@ def test_a_late_or_early_group_of_points_is_found_by_its_name(urdf_folder, late)
     source = taken(step, 1, camera=False, steps=150)
     [group] = source.points
     source = replace(source, points=(replace(group, name="points_mocap", sensor_name="mocap", std=1e-3),))
-    options = ProblemOptions(path_cutoff=np.inf)
-    free = ("elbow.damping", f"{latency}.delay")
+    options, free = ProblemOptions(path_cutoff=np.inf), ("elbow.damping", f"{latency}.delay")
     true = EstimationProblem(step, [source], free, options).simulate_synthetic_recording(seed=3)
     [seen] = true.points
     made = replace(true, points=(replace(seen, t=seen.t + late),))

@@ -15,7 +15,7 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, fit_problem
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.build_problem import build_problem, make_problem_options
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 from yid_ocp.workflow.simulate import run_simulate
 
@@ -42,8 +42,7 @@ STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
 
 
 def blank(straight=STRAIGHT, name="mark"):
-    t = np.arange(41) * 0.01
-    position = np.broadcast_to(STRAIGHT - np.array([0.0, 0.0, 0.004]), (41, 1, 3))
+    t, position = np.arange(41) * 0.01, np.broadcast_to(STRAIGHT - np.array([0.0, 0.0, 0.004]), (41, 1, 3))
     points = (PointGroup("points", (name,), t, position, 1e-4),)
     return Recording(None, points, marker_reference_pose=None if straight is None else straight[None, :])
 
@@ -84,6 +83,18 @@ def test_what_an_object_without_a_robot_cannot_have_is_refused_in_words(tmp_path
     run = settings(tmp_path, recording, overrides)
     with pytest.raises(kind, match=words):
         build_problem(run)
+
+
+def test_points_of_a_cable_may_be_in_groups_with_their_own_times(tmp_path):
+    """The clamps are seen every 10 ms, and the cable between them every 30 ms."""
+    (tmp_path / "shape.csv").write_text("point,x,y,z\n" + "".join(f"p{i},{i},0,0\n" for i in range(5)))
+    x, held = np.tile(np.arange(5)[:, None] * np.eye(3)[0], (31, 1, 1)), ("p0", "p1", "p3", "p4")
+    clamps = PointGroup("points_clamps", held, 0.01 * np.arange(31), x[:, [0, 1, 3, 4]])
+    recording = Recording(None, (PointGroup("points", ("p2",), 0.03 * np.arange(11), x[:11, [2]]), clamps))
+    item = "{kind: cable, main_branch_vertex_names: [p0, p1, p2, p3, p4], undeformed_shape_file: shape.csv}"
+    run = settings(tmp_path, recording, (f"model.object={item}", "model.frames={}", "parameters={}", "sensors={}"))
+    sensors = make_problem_options(run, build_system(run), read_recordings_of_role(run)).sensors
+    assert (sensors["points"].used_points, sensors["points_clamps"].use) == (("p2",), False)
 
 
 def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
@@ -175,11 +186,8 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, printed):
     later, older = (folder_of(tmp_path / name) for name in ("later", "older"))
     (later / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{baseline_run_folders: [{folders[0]}]}}\n", "utf-8")
     (older / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{worth: 3}}\n", "utf-8")
-    refused = (
-        (later, "would count twice"),
-        (older, "CHANGELOG.md"),
-        (folder_of(tmp_path / "old", doubts=[]), "earlier"),
-    )
+    old = folder_of(tmp_path / "old", doubts=[])
+    refused = ((later, "would count twice"), (older, "CHANGELOG.md"), (old, "earlier"))
     for runs, message in [*(([folders[0], run], text) for run, text in refused), (folders[:1], "fewer than two runs")]:
         assert message in printed("report", *runs, "--out", tmp_path / "other", code=2)
 

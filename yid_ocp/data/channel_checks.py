@@ -26,8 +26,7 @@ _MAX_SAMPLE_PERIOD = 0.02  # longest period at which arm motion counts as slow [
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
     """Yield group, channel, times [s] and values (N,) or (N, 3) of each measured channel of the `wanted` quantities."""
-    joints = recording.joints
-    if joints is not None:
+    if (joints := recording.joints) is not None:
         for quantity, values in joints.values_by_channel.items():
             for j, name in enumerate(joints.names if quantity in wanted else ()):
                 yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
@@ -114,8 +113,7 @@ def noise_or_quantization_std(t: Array, values: Array) -> float:
 
 def _stated(recording: Recording, choice: SensorOptionsFunction, group: str, channel: str) -> float:
     """Noise standard deviation of a channel as the settings or else the recording state it; zero if neither does."""
-    joints = recording.joints
-    quantity, _, name = channel.partition(".")
+    joints, (quantity, _, name) = recording.joints, channel.partition(".")
     if group == "joints" and joints is not None:
         said = choice(f"joints.{quantity}").std
         if isinstance(said, Mapping):
@@ -129,9 +127,7 @@ def _stated(recording: Recording, choice: SensorOptionsFunction, group: str, cha
     if isinstance(said, (int, float)):
         return float(said)
     own_group = next(entry for entry in recording.points if entry.name == group)
-    if own_group.std is None:
-        return 0.0
-    spread = own_group.std[:, own_group.names.index(channel)]
+    spread = np.nan if own_group.std is None else own_group.std[:, own_group.names.index(channel)]
     return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
 
 
@@ -245,14 +241,15 @@ def typical_point_pair_distances(
     """Return the typical distance [m] between the two points of each pair in `edges`.
 
     It is the mean over the first `frames` frames of a recording (None: all frames), then the median over the
-    recordings. Raises `DataError` if a point is not recorded, or if no frame shows both points of a pair.
+    recordings. If the points are in two groups, the frames are those of the group with fewer samples, and the other
+    point is interpolated. Raises `DataError` if a point is not recorded, or if no frame shows both points of a pair.
     """
     result: dict[tuple[str, str], float] = {}
     for edge in edges:
         seen = []
         for recording in recordings:
-            groups = [recording.group_of_point(point) for point in edge]
-            begin, end = (own.position[:frames, own.names.index(p)] for own, p in zip(groups, edge, strict=True))
+            t = min((recording.group_of_point(point).t for point in edge), key=len)[:frames]
+            begin, end = np.swapaxes(recording.point_positions(edge, t), 0, 1)
             length = np.linalg.norm(end - begin, axis=1)
             if np.any(np.isfinite(length)):
                 seen.append(float(np.nanmean(length)))

@@ -296,6 +296,17 @@ class Recording(ReprMixin):
         require_known_names([name], self.point_names, "point", f"recording '{self.name}'", DataError)
         return next(group for group in self.points if name in group.names)
 
+    def point_positions(self, names: Sequence[str], t: Array | None = None) -> Array:
+        """Return the positions (M, len(names), 3) [m] of points at times `t` (default: those of the first point).
+
+        They are interpolated linearly, and NaN outside of a group's times. `DataError` if a point is not recorded.
+        """
+        found, groups = [], [self.group_of_point(name) for name in names]
+        for name, group in zip(names, groups, strict=True):
+            columns, at = group.position[:, group.names.index(name)].T, groups[0].t if t is None else t
+            found.append(np.stack([np.interp(at, group.t, column, np.nan, np.nan) for column in columns], axis=1))
+        return np.stack(found, axis=1)
+
     @property
     def duration(self) -> float:
         """Time from the earliest to the latest sample of all groups [s]."""
@@ -390,9 +401,8 @@ def _constant(value: ArrayLike, where: str) -> float | Array:
 def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: Iterable[str]) -> None:
     """Convert the named fields of a new group to read-only arrays, except None, and its `names` to a tuple."""
     object.__setattr__(group, "names", tuple(group.names))
-    for name in names:
-        if getattr(group, name) is not None:
-            object.__setattr__(group, name, read_only_copy(getattr(group, name), f"{group.name}/{name}"))
+    for name in (name for name in names if getattr(group, name) is not None):
+        object.__setattr__(group, name, read_only_copy(getattr(group, name), f"{group.name}/{name}"))
 
 
 def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
@@ -436,8 +446,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
     _check_text(where, ("sensor", group.sensor_name), ("frame", group.frame))
     _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", "(M, np, 3)")
     unseen = np.isnan(group.position).all(axis=2)
-    bad = ~np.isfinite(group.position).all(axis=2) & ~unseen
-    if bad.any():
+    if (bad := ~np.isfinite(group.position).all(axis=2) & ~unseen).any():
         row, column = (int(index[0]) for index in np.nonzero(bad))
         position = np.round(group.position[row, column], 6).tolist()
         what = f"the position of point '{group.names[column]}' is {position} m at t = {group.t[row]:g} s"
@@ -538,8 +547,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     bad = np.flatnonzero(~np.isfinite(group.t))
     what = f"the time at index {next(iter(bad), 0)} is {group.t[next(iter(bad), 0)]}"
     raise_data_error_unless(bad.size == 0, what, f"{where}/t", "finite times [s]", "remove the sample in every channel")
-    backward = np.flatnonzero(np.diff(group.t) <= 0)
-    if backward.size:
+    if (backward := np.flatnonzero(np.diff(group.t) <= 0)).size:
         index = int(backward[0])
         before, after = float(group.t[index]), float(group.t[index + 1])
         what = f"the clock does not advance from index {index} to {index + 1}: {before!r} s, then {after!r} s"

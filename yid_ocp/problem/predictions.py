@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validated_recording
 from yid_ocp.display import ReprMixin, ReprTexts
-from yid_ocp.errors import DataError, failed_rollout_error, require_known_names
+from yid_ocp.errors import DataError, failed_rollout_error
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -35,9 +35,9 @@ def naive_cable_predictions(
     junction. The first two frames are as measured. Raises `DataError` if a point is not recorded or not measured in the
     second frame, or if there are fewer than three frames.
     """
-    start, parent, held = _start_frame(recording, points), cable.main_branch_vertex_names, cable.clamped_vertex_names
-    line = np.cumsum(np.linalg.norm(np.diff(_start_frame(recording, parent), axis=0), axis=1))
-    arc = dict(zip(parent, [0.0, *line], strict=True))
+    t, parent, held = recording.group_of_point(points[0]).t, cable.main_branch_vertex_names, cable.clamped_vertex_names
+    start, chain = (_start_frame(recording, names, t) for names in (points, parent))
+    arc = dict(zip(parent, [0.0, *np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))], strict=True))
     junction = {point: branch[0] for branch in cable.child_branch_vertex_names.values() for point in branch[1:]}
     ends = sorted(knots or (parent[0], parent[-1]), key=arc.__getitem__)
     places, between = [arc[junction.get(point, point)] for point in points], [arc[point] for point in ends]
@@ -45,29 +45,18 @@ def naive_cable_predictions(
         "moves_with_clamps": (held, np.full((len(points), len(held)), 1.0 / len(held))),
         "linear_carry": (ends, np.stack([np.interp(places, between, row) for row in np.eye(len(ends))], axis=1)),
     }
-    found = {"stays": np.array(recorded_point_positions(recording, points))}
+    found = {"stays": recording.point_positions(points, t)}
     found["stays"][_GIVEN_FRAMES:] = start
     for name, (known, share) in shares.items():
-        moved = recorded_point_positions(recording, known) - _start_frame(recording, known)
+        moved = recording.point_positions(known, t) - _start_frame(recording, known, t)
         found[name] = found["stays"].copy()
         found[name][_GIVEN_FRAMES:] += np.einsum("pk,mkx->mpx", share, moved)[_GIVEN_FRAMES:]
     return found
 
 
-def recorded_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Return the measured positions (M, len(points), 3) [m] of points in one group of a recording, or `DataError`."""
-    for group in recording.points:
-        if set(points) <= set(group.names):
-            return group.position[:, [group.names.index(point) for point in points]]
-    where = f"recording '{recording.name}'"
-    require_known_names(points, recording.point_names, "point", where, DataError)
-    what = f"the points {', '.join(points)} are in different groups, but one group must have all of them"
-    raise DataError(what, where=where, allowed="points of one group", hint="import these points as one group")
-
-
-def _start_frame(recording: Recording, points: Sequence[str]) -> Array:
-    """Measured positions (len(points), 3) [m] in the second frame, from which predictions without a model start."""
-    at, where = recorded_point_positions(recording, points), f"recording '{recording.name}'"
+def _start_frame(recording: Recording, points: Sequence[str], t: Array) -> Array:
+    """Measured positions (len(points), 3) [m] at the second time, from which predictions without a model start."""
+    at, where = recording.point_positions(points, t), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"only {len(at)} frames have the cable's points", f"{_GIVEN_FRAMES + 1} frames or more"
         raise DataError(what, where=where, allowed=allowed, hint=f"remove {recording.name} from `recordings`")

@@ -88,10 +88,11 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
     kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     if cable is not None and item is not None:
         clamps = cable.clamp_pose_point_names
-        for name in {group.name for group in groups}:
-            said = sensors.setdefault(name, SensorOptions())
+        for group in groups:
+            said = sensors.setdefault(group.name, SensorOptions())
             if said.used_points is None:
-                sensors[name] = replace(said, used_points=cable.unclamped_vertex_names)
+                free = tuple(name for name in cable.unclamped_vertex_names if name in group.names)
+                sensors[group.name] = replace(said, used_points=free, use=said.use if free else False)
         for recording in recordings:
             lengths = typical_point_pair_distances(cable.edge_vertex_names, [recording], _START_FRAMES)
             if values := item.edge_length_parameter_values(lengths):
