@@ -47,10 +47,7 @@ class Thresholds:
         float, Ge(0), OptionInfo("how far a value may leave its usual range: in widths, or a factor of 1 + this")
     ] = 1.0
     min_explained_fraction: Annotated[
-        float,
-        Ge(0),
-        Le(1),
-        OptionInfo("fraction of the fitted gap that one effect must explain, if its closure is too small"),
+        float, Ge(0), Lt(1), OptionInfo("fraction of the fitted gap that one effect must explain")
     ] = 0.75
     min_closure: Annotated[
         float, Ge(0), Lt(1), OptionInfo("lower end of the closure's 95 % interval that one effect must reach otherwise")
