@@ -16,10 +16,8 @@ from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     VERDICT_SENTENCE_TEXTS,
-    VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     mark_free_estimates_not_trusted,
-    value_and_uncertainty_text,
 )
 from yid_ocp.inference.whitening import problem_with_exact_inputs
 from yid_ocp.problem import EstimationProblem
@@ -123,7 +121,7 @@ def compare_methods(
     else:
         judged = estimation.add_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
-    explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
+    explained = tuple(_explanations(runs, best, judged.parameters, truth or {}))
     return MethodsComparisonResult(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
 
 
@@ -147,46 +145,50 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
 
 
 def _explanations(
-    runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
+    runs: Sequence[_MethodResult],
+    best: _MethodResult,
+    judged: Mapping[str, ParameterEstimate],
+    truth: Mapping[str, float],
 ) -> list[str]:
     runs, sentences = [run for run in runs if run.has_values], []
     for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
-        ends = "The recordings do not determine it, so no value is shown" if is_lost else f"Its values are {places}"
-        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}. {ends}")
+        ends = "no value is shown, as the recordings do not determine it" if is_lost else f"methods may differ: {places}"
+        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}; {ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
-    return sentences + [_descent_errors(run, judged, truth, disturbed) for run in descents]
+    return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
 
 
 def _descent_errors(
-    run: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
+    run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> str:
-    """Return a sentence on the parameters that a method left far from `truth`, and whether the data determine them."""
-    known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
-    own = {name: run.solution.parameters[name] for name in known}
-    # the same limit applies to the standard deviation of an identifiable parameter
-    wrong = [n for n in known if abs(own[n].value - truth[n]) > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[n])]
-    hidden = [name for name in known if known[name].verdict != "identifiable"]
-    verdicts = {name: VERDICT_TABLE_TEXTS[(known if name in hidden else own)[name].verdict] for name in known}
-    within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
+    """Return a sentence on the parameters that a method left far from `truth` although the recordings determine them.
+
+    `best` is the method of lowest cost, which shows whether the deviation is one of this method or of all.
+    """
+
+    def is_far(method: _MethodResult, name: str) -> bool:
+        # the same limit applies to the standard deviation of an identifiable parameter
+        distance = abs(method.solution.parameters[name].value - truth[name])
+        return distance > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[name])
+
+    wrong = [name for name, entry in judged.items() if entry.free and name in truth and is_far(run, name)]
+    seen, limit = [name for name in wrong if judged[name].verdict == "identifiable"], MAX_IDENTIFIABLE_RELATIVE_STD
     if not wrong:
-        return f"{run.method} ended {within} for all parameters"
-    shown = {name: value_and_uncertainty_text(own[name].value, None, verdict=known[name].verdict) for name in wrong}
-    places = ", ".join(f"{name} ({shown[name]}, true {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
-    text = f"{run.method} did not end {within} for {places}"
-    if wrong == hidden:
-        return f"{text}. These are exactly the parameters that are not found"
-    seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
-    if seen:
-        why = "it ignores noise of the torques" if disturbed else "its cost weights the measurements differently"
-        if run.solution.status != Status.CONVERGED:
-            why = f"the method ended too early ({run.solution.status.value})"
-        text += f". The recordings determine {', '.join(seen)}, but {run.method} does not find this, because {why}"
-    if lucky:
-        text += f". Nevertheless {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} ended near the truth"
-    return text
+        return f"{run.method} ended within {100 * limit:.0f} % of the truth for all parameters"
+    if not seen:
+        said = f"{run.method} is more than {100 * limit:.0f} % from the truth only for {', '.join(wrong)}"
+        return f"{said}, and no value of these counts as found"
+    own = {name: run.solution.parameters[name] for name in seen}
+    places = ", ".join(f"{name} ({entry.value:.3g} {entry.unit}, true {truth[name]:.3g})" for name, entry in own.items())
+    why = "its cost weights the measurements differently"
+    if run.solution.status != Status.CONVERGED:
+        why = f"it ended too early ({run.solution.status.value})"
+    elif all(is_far(best, name) for name in seen):
+        why = "like all methods except `solve`, it ignores noise of the torques or angles that move the model"
+    return f"The recordings determine {places}, but {run.method} does not find this, because {why}"
 
 
 class _Memory:

@@ -195,7 +195,7 @@ class NamedStepEquations(ReprMixin):
         joints, internal = system.mechanism.joint_names, tuple(system.effect_internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
         rows = (
-            _SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum"),
+            _SymbolBlock("del", joints, e.momentum_balance, "discrete Euler-Lagrange equation, balance of momentum"),
             _SymbolBlock("internal", internal, e.internal_residual, "equation of an internal coordinate"),
             _SymbolBlock("constraint", closed, e.constraint_residual, "equation of a grasp"),
             _SymbolBlock("p1", joints, e.p1, "momentum after the step"),

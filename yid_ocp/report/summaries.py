@@ -10,6 +10,7 @@ from typing import Any
 from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.inference.uncertainty import (
+    MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
@@ -215,7 +216,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
         spread = (
-            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else f"{s:.2g} times" for s in stds
+            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else f"{s:.0f} times" for s in stds
         )
         interval = _interval_cell(entry, None if stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
@@ -225,11 +226,15 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
-    yield "Record other motions (`yid-ocp plan`), or fix some (parameters.NAME.free: false)." if hidden else ""
+    cure = "Record other motions (`yid-ocp plan`), or fix one of them (--set parameters.NAME.free=false)"
+    yield f"{cure} at a known value (--set parameters.NAME.initial=VALUE)." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
+    elif result["at"] == "initial":
+        names = ", ".join(result["profiles"])
+        yield f"The values are initial ones, but the interval of {names} belongs to a fit from there. Omit --initial."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]")]
@@ -407,19 +412,27 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "Equations: those of a step that contain the parameter. Observed: those that influence a sensor. [std]: change "
-        f"per unit of the parameter, in stds of noise, in one reading from equilibrium ({seconds:.2g} s) or all."
+        "Equations: those of a step that contain the parameter; the last tables explain their names. Observed: those of "
+        "them to which a sensor reacts. [std]: change per unit of the parameter, in stds of noise, of one reading after "
+        f"equilibrium ({seconds:.2g} s) or of all recorded readings."
     )
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
+    moved = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
+    sizes = {n: abs(result["parameters"][n]["value"]) for n in moved}
+    lost = [n for n, along in moved.items() if sizes[n] and along * sizes[n] * MAX_WEAK_RELATIVE_STD < 1]
+    said = f"The recordings cannot determine {', '.join(lost)} near these values: even if all else were known, the ± would "
+    yield SummaryStatement(f"{said}exceed {MAX_WEAK_RELATIVE_STD:g} times the value." if lost else "", "verdict")
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "The column 'observed' is left out, because it can be computed only at an equilibrium."
-    said = f"The spectral radius of A, linearised at {linear['at']}, is {linear['spectral_radius']:.6g}."
-    yield SummaryStatement(f"{said} Above 1, small deviations grow.", "verdict")
+        yield "The column 'observed equations' is left out, because it can be computed only at an equilibrium."
+    radius = linear["spectral_radius"]
+    grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
+    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
+    yield SummaryStatement(said, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
-        bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else ""
+        bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
     sizes = [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
@@ -449,7 +462,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Yield the rows that contain each free or named parameter, and the change of readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    head = "parameter", "unit", "equations", "which", "observed", "best sensor", "measured by"
+    head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
     yield *head, "equilibrium [std]", "recordings [std]"
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
