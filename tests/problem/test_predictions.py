@@ -249,7 +249,7 @@ def test_what_cannot_be_predicted_is_said(recording):
         naive_cable_predictions(recording, CABLE, ("p9",))
     seen, t = recording.points[0].position.copy(), recording.points[0].t
     short = Recording(points=(PointGroup("points", NAMES, t[:2], seen[:2]),), name="short")
-    with pytest.raises(DataError, match="only 2 frames have the cable's points"):
+    with pytest.raises(DataError, match="have 2 samples only"):
         naive_cable_predictions(short, CABLE, ("p2",))
     seen[1, 2] = np.nan
     hidden = Recording(points=(PointGroup("points", NAMES, t, seen),), name="hidden")

@@ -431,7 +431,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "branches of a cable": ((*CABLE, "--branch", "a=1,1,1"), "the object 'cable' has no branches", "--object tree"),
     "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
     "branches of one name": ((*TREE, "--branch", "a=1,1,1"), "two branches are called 'a'", "--branch"),
-    "negative length": ((*CABLE, "--length", "-1"), "the length is -1, not above 0", "--length 0.1"),
+    "negative length": ((*CABLE, "--length", "-1"), "the length is -1, not above 0", "write --length NUMBER"),
     "grams": ((*CABLE, "--mass", "50"), "'cable' has the density 2e+06 kg/m^3", "--mass"),
     "too many links": ((*CABLE, "--links", "99"), "--links is 99", "--links"),
     "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),

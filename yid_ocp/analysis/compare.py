@@ -155,7 +155,9 @@ def _explanations(
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
-        ends = "no value is shown, as the recordings do not determine it" if is_lost else f"methods may differ: {places}"
+        ends = (
+            "no value is shown, as the recordings do not determine it" if is_lost else f"methods may differ: {places}"
+        )
         sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}; {ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
@@ -182,7 +184,9 @@ def _descent_errors(
         said = f"{run.method} is more than {100 * limit:.0f} % from the truth only for {', '.join(wrong)}"
         return f"{said}, and no value of these counts as found"
     own = {name: run.solution.parameters[name] for name in seen}
-    places = ", ".join(f"{name} ({entry.value:.3g} {entry.unit}, true {truth[name]:.3g})" for name, entry in own.items())
+    places = ", ".join(
+        f"{name} ({entry.value:.3g} {entry.unit}, true {truth[name]:.3g})" for name, entry in own.items()
+    )
     why = "its cost weights the measurements differently"
     if run.solution.status != Status.CONVERGED:
         why = f"it ended too early ({run.solution.status.value})"

@@ -243,8 +243,9 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
             if len(numbers) != 3 or not all(map(math.isfinite, rows[quantity][-1][:2])):
                 raise ValueError
         except ValueError:
-            what = f"the row '{','.join(words)}' is not a quantity, its unit and three numbers"
-            raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=hint) from None
+            what = f"in the row '{','.join(words)}', at, torque or std is no number, or a cell is missing"
+            fix = f"correct or delete the row; {hint}"
+            raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=fix) from None
     wanted = depends_on.split("+")
     if set(rows) != set(wanted):
         what = f"the table has {', '.join(rows) or 'no rows'}, but the law depends on {depends_on}"

@@ -122,8 +122,12 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
 
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
-        allowed, hint = unknown_name_error_arguments("", system.point_frames)["allowed"], "set plan.point: FRAME"
-        raise ConfigError("plan.point is missing", where="plan.point", allowed=allowed, hint=hint)
+        allowed, what = (
+            unknown_name_error_arguments("", system.point_frames)["allowed"],
+            "the point to be moved to the target",
+        )
+        hint = f"add --set plan.point={(*system.point_frames, 'FRAME')[0]} or another point"
+        raise ConfigError(f"plan.point is missing, {what}", where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
     inside = FramePositionEvaluator(system, boxed, "plan.frames_in_box") if options.goal == "box" else None

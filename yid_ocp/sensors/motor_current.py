@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_name_question
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
 from yid_ocp.sensors.joints import JointSensor, filtered_effort_sensor_data
@@ -52,9 +52,14 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
     if choice.use is False or not names or around.recording.joints is None:
         return None
     for name in group.names:
-        if name not in (known := around.system.mechanism.joint_names):
-            said = unknown_name_error_arguments(name, known, f"set sensors.{key}.use: false")
-            raise DataError(f"the model has no joint '{name}', whose current is recorded", where=where, **said)
+        if name not in around.system.mechanism.joint_names:
+            motors = around.system.prescribed
+            hint = f"correct the name in the recording, or set sensors.{key}.use: false"
+            hint = (
+                f"{nearest_name_question(name, motors)} If so, {hint}" if nearest_name_question(name, motors) else hint
+            )
+            what, allowed = f"the model has no joint '{name}', whose current is recorded", ", ".join(motors)
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)

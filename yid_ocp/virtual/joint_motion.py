@@ -268,8 +268,11 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
     )
     miss = np.abs(result.fun[: gap.numel_out(0)]).max()
     if miss > 1e-7:
-        where = ", ".join(f"{grasp.holder_frame} -> {grasp.held_frame}" for grasp in system.grasps)
-        what = f"the grippers miss the grasped points by {1e3 * miss:.3g} mm at the best joint angles found"
-        hint = "set model.object.mount.xyz nearer to the robot, or pass other start_angles or offsets"
+        worst = system.grasps[int(np.abs(result.fun[: gap.numel_out(0)]).argmax()) // 3]
+        where, size = f"model.grasp.{worst.name}", f"{miss:.3g} m" if miss >= 1 else f"{1e3 * miss:.3g} mm"
+        what = (
+            f"{worst.holder_frame} cannot reach {worst.held_frame}: {size} are missing at the best joint angles found"
+        )
+        hint = "set model.object.mount.xyz nearer to the robot, or grasp another point"
         raise ModelError(what, where=where, allowed="grasps within reach and within the joint limits", hint=hint)
     return at(result.x)

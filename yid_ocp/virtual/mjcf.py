@@ -462,8 +462,11 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
-            what, hint = f"the servo of '{joint}' has a dead band, unlike MuJoCo's", f"set {joint}.servo_dead_band to 0"
-            raise ModelError(what, where=f"joint '{joint}'", allowed=f"{joint}.servo_dead_band: 0", hint=hint)
+            what, where = (
+                f"MuJoCo cannot express the dead band of the servo of '{joint}'",
+                f"parameters.{joint}.servo_dead_band.initial",
+            )
+            raise ModelError(what, where=where, allowed="0", hint=f"add --set {where}=0")
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
         what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave the effect on the clock out"
         raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)

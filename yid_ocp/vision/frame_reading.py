@@ -138,9 +138,13 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"the intrinsics of the camera are unknown: {len(nearest)} instead of 1 topic may contain them"
+        what = f"several topics may have the intrinsics of the camera: {', '.join(nearest)}"
+        what = what if nearest else "the bag has no topic with the intrinsics of the camera"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
-        raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
+        hint = (
+            f"record {beside_it}/camera_info as well, or write a folder of frames whose camera.json has the intrinsics"
+        )
+        raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
     info = _first(bag, nearest[0])
     # ROS 1 spells them with a capital
     fields = (getattr(info, name, getattr(info, name.upper(), ())) for name in ("k", "p", "d"))

@@ -213,9 +213,12 @@ def _none_good(
         "time stamp is": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "from end to end": _hint(sizes, things, "tighten track.options.filters, or loosen them if a part is missing"),
+        "dense enough": _hint(sizes, things, "check track.point_cloud_unit, and loosen track.options.filters"),
+        "cannot be used": "copy or export the damaged files again",
         "crosses or touches itself": "record the object without crossings and contacts of its parts",
     }
-    hint = next((own for words, own in of_cause.items() if words in most), _hint(sizes, things, hint))
+    hints = [own for words, own in of_cause.items() if any(words in reasons[0] for reasons in often)]
+    hint = "; ".join(hints) or _hint(sizes, things, hint)
     what = ". ".join([f"{cause}no frame could be used", *(x + own[0] for x, own in zip(starts, often, strict=True))])
     return DataError(what, where=source, allowed="one usable frame or more", hint=hint)
 

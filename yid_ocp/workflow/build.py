@@ -214,7 +214,12 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             value = entry.value if given.initial is None else factor * given.initial
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
-                fault, hint = ("reversed", "exchange the numbers") if lower > upper else ("too wide", "narrow them")
+                low, high = max(lower, entry.lower) / factor, min(upper, entry.upper) / factor
+                numbers = f"[{low:g}, {high:g}]".replace("inf", ".inf") if low <= high else "two of the allowed numbers"
+                hint = f"set parameters.{key}.bounds to {numbers}"
+                fault = f"too {'low' if lower < entry.lower else 'high'}"
+                if lower > upper:
+                    fault, hint = "reversed", "exchange the numbers"
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are {fault}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed, hint=hint)

@@ -120,9 +120,19 @@ def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterat
         yield
     except YidError as error:
         inner = tuple(error.where.split("."))  # the key itself may come from --set
-        where = run.setting_location(*(inner if inner[: len(path)] == path else path))
+        known = (key for key in run.key_locations if key[: len(path)] == path and _value_at(run, key) == error.where)
+        where = run.setting_location(*(inner if inner[: len(path)] == path else next(known, path)))
         where = where if error.where in where else f"{where} ({error.where})"
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
+
+
+def _value_at(run: RunSettings, path: Sequence[str | int]) -> str:
+    """Return the text of a setting; empty if it is no text."""
+    value: Any = run
+    for key in path:
+        entries = dict(enumerate(value)) if isinstance(value, tuple | list) else value
+        value = (entries if isinstance(entries, Mapping) else getattr(entries, "__dict__", {})).get(key)
+    return value if isinstance(value, str) else ""
 
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
