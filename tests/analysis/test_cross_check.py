@@ -52,7 +52,7 @@ def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith(
-        "the built model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio to within "
+        "the built model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio, except "
     )
 
 

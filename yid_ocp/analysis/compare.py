@@ -155,9 +155,7 @@ def _explanations(
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
-        ends = (
-            "no value is shown, as the recordings do not determine it" if is_lost else f"methods may differ: {places}"
-        )
+        ends = "no value is shown, because the data do not determine it" if is_lost else f"methods may differ: {places}"
         sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}; {ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
@@ -166,10 +164,7 @@ def _explanations(
 def _descent_errors(
     run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> str:
-    """Return a sentence on the parameters that a method left far from `truth` although the recordings determine them.
-
-    `best` is the method of lowest cost, which shows whether the deviation is one of this method or of all.
-    """
+    """Return a sentence on the parameters that a method, and perhaps also `best`, left far from `truth`."""
 
     def is_far(method: _MethodResult, name: str) -> bool:
         # the same limit applies to the standard deviation of an identifiable parameter
@@ -183,16 +178,14 @@ def _descent_errors(
     if not seen:
         said = f"{run.method} is more than {100 * limit:.0f} % from the truth only for {', '.join(wrong)}"
         return f"{said}, and no value of these counts as found"
-    own = {name: run.solution.parameters[name] for name in seen}
-    places = ", ".join(
-        f"{name} ({entry.value:.3g} {entry.unit}, true {truth[name]:.3g})" for name, entry in own.items()
-    )
+    own = [(name, run.solution.parameters[name]) for name in seen]
+    places = ", ".join(f"{name} = {entry.value:.3g} {entry.unit} (true {truth[name]:.3g})" for name, entry in own)
     why = "its cost weights the measurements differently"
     if run.solution.status != Status.CONVERGED:
         why = f"it ended too early ({run.solution.status.value})"
     elif all(is_far(best, name) for name in seen):
         why = "like all methods except `solve`, it ignores noise of the torques or angles that move the model"
-    return f"The recordings determine {places}, but {run.method} does not find this, because {why}"
+    return f"{run.method} gives {places}, although the recordings determine this, because {why}"
 
 
 class _Memory:

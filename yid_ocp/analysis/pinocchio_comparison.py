@@ -51,7 +51,7 @@ class _PinocchioComparison:
         parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
             said = f"{self.of}: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio"
-            return f"{said} to within {max(parts.values()):.1g} of the largest entry"
+            return f"{said}, except for rounding errors ({max(parts.values()):.1g} of the largest entry)"
         wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts.items() if not size <= _RELATIVE_TOLERANCE]
         tolerated = f"of the largest entry ({100 * _RELATIVE_TOLERANCE:g} % is tolerated)"
         return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} {tolerated}. Find the cause before you use it"

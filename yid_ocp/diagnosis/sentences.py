@@ -51,7 +51,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
         "unknown": mostly or "Record faster and larger motions of all joints, which show more effects.",
-        "no_gap": "None is needed for motions like these. Other motions may still show a gap.",
+        "no_gap": "None is needed: the model explains motions like these. Other motions may still show a gap.",
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. If the named cause is right, its estimates stay the same.",
     }
@@ -150,7 +150,7 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
     parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= MIN_GAP_SHARE else []
-    named = ", ".join(f"{100 * part:.0f} % comes from {place}" for part, place in parts)
+    named = ", ".join(f"{100 * part:.0f} % from {place}" for part, place in parts).replace("% from", "% comes from", 1)
     origin = result.smoother_result.plant_or_sensor_origin
     side = f"; its origin is {GAP_ORIGIN_TEXTS[origin]}" * (has_origin and origin in ("plant", "sensor", "either"))
     return f"Of the error beyond noise that can be located, {named}{side}."
@@ -267,12 +267,14 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
-        text.append(_listed("Significant changes since the baseline (earlier runs): ", moved) or same * (not rivals))
+        text.append(
+            _listed("Changed by more than the ± since the baseline (earlier runs): ", moved) or same * (not rivals)
+        )
         text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
         p = since.between_runs_p_value
-        differ = f"Runs of the baseline differ by more than their uncertainty (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
+        differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-        text += [f"{differ} The ± of the baseline includes this difference." * (p < _RUNS_DIFFER_LEVEL)]
+        text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
         text += [small * (not since.is_baseline_explained)]
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
     for how, part in parts.items():

@@ -231,7 +231,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
     Raises `DataError` for a malformed file, knots that are not evenly spaced and increasing, or other quantities.
     """
     allowed = f"a header {','.join(_TABLE_COLUMNS)}, then rows of a quantity, its unit and three numbers"
-    hint = "write the table like law.csv in a run folder of `yid-ocp diagnose`"
+    hint = "correct or delete this line; law.csv in a run folder of `yid-ocp diagnose` is an example"
     lines = [line.split(",") for line in read_input_text(path).splitlines() if line.strip()]
     if not lines or tuple(word.strip() for word in lines[0]) != _TABLE_COLUMNS:
         raise DataError("the header is not that of a torque law", where=f"{path}, line 1", allowed=allowed, hint=hint)
@@ -244,8 +244,7 @@ def read_torque_law_tables(path: Path, depends_on: TorqueLawQuantitiesName) -> t
                 raise ValueError
         except ValueError:
             what = f"in the row '{','.join(words)}', at, torque or std is no number, or a cell is missing"
-            fix = f"correct or delete the row; {hint}"
-            raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=fix) from None
+            raise DataError(what, where=f"{path}, line {number}", allowed=allowed, hint=hint) from None
     wanted = depends_on.split("+")
     if set(rows) != set(wanted):
         what = f"the table has {', '.join(rows) or 'no rows'}, but the law depends on {depends_on}"

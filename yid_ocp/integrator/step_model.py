@@ -79,8 +79,8 @@ class NewtonStatusCode(IntEnum):
 _STATUS_MESSAGES = {
     NewtonStatusCode.OK: "converged",
     NewtonStatusCode.NOT_CONVERGED: "Newton's method found no solution of its equations",
-    NewtonStatusCode.SINGULAR: "the equations of the step are singular; "
-    "look for redundant grasps or a joint without inertia",
+    NewtonStatusCode.SINGULAR: "the equations of the step are singular; look in model.grasp for two grasps that hold "
+    "the same point, and in the robot file for a joint that moves no mass",
     NewtonStatusCode.NOT_FINITE: "the state is no longer finite, because the simulated motion is unstable; "
     "add damping or, for driven arms, a tracking filter",
     NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
@@ -89,8 +89,8 @@ _STATUS_MESSAGES = {
 _LONG_ROLLOUT_STEPS = 100
 """Number of steps after which a failure is attributed to the integration method, not to the initial state."""
 _INSTABILITY_HINT = (
-    "the midpoint rule has no numerical damping: if the model has no damping either, the fastest vibrations can grow "
-    "over some hundred steps until Newton's method fails"
+    "set model.damping above 0 if it is 0, or halve problem.time_step: the midpoint rule has no numerical damping, so "
+    "the fastest vibrations of an undamped model can grow over some hundred steps"
 )
 
 

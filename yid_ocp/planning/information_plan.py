@@ -238,7 +238,7 @@ def _check_seen(
         worst = max(unseen[name] for name in lost)
         what = f"no motion gives information about {', '.join(lost)}: a change by the whole value of a parameter "
         what += f"changes all readings together by at most {worst:.1g} standard deviations"
-        hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
+        hint = "; ".join(dict.fromkeys(_would_see(experiment, name, _random(experiment, 0)) for name in lost))
         where = "plan.parameters_to_identify"
         raise ConfigError(what, where=where, allowed="a parameter that changes readings", hint=hint)
     for effect in rivals:
@@ -262,12 +262,10 @@ def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    motion = f"if {name} changes by its whole value, in a random motion of {_PROBE_AMPLITUDE:g} rad"
-    moved_by = f"{1e3 * farthest[best]:.2g} mm {motion}"
+    moved_by = f"{1e3 * farthest[best]:.2g} mm if {name} changes by its whole value"
     if farthest[best] > _MIN_VISIBLE_MOTION:
-        return f"let a camera measure {seen[best].description}: its position changes by {moved_by}"
-    grasp = f"choose a grasp that loads {name} (`identifiability --what-if` compares some), or set its `free: false`"
-    return f"{grasp}; no measurable point changes its position by more than {moved_by}"
+        return f"let a camera measure {seen[best].description}, which moves by {moved_by}"
+    return "choose another grasp (`yid-ocp identifiability --what-if` ranks some), or set parameters.NAME.free: false"
 
 
 def _plan(
@@ -290,7 +288,9 @@ def _plan(
         way = "lower plan.limits, or set another plan.start_joint_positions"
         message = f"the result is the best random initial motion. For the search to improve it, {way}"
     elif not chosen.is_converged:
-        message = f"a better motion may exist. The search ended at plan.max_iterations, {chosen.n_iterations} rounds"
+        message = (
+            f"plan.max_iterations ended the search ({chosen.n_iterations} rounds). Raise it or use this motion"
+        )
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

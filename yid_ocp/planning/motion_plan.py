@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
@@ -122,12 +122,8 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
 
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
-        allowed, what = (
-            unknown_name_error_arguments("", system.point_frames)["allowed"],
-            "the point to be moved to the target",
-        )
-        hint = f"add --set plan.point={(*system.point_frames, 'FRAME')[0]} or another point"
-        raise ConfigError(f"plan.point is missing, {what}", where="plan.point", allowed=allowed, hint=hint)
+        what, hint = "plan.point is missing, the point that moves to the target", "add --set plan.point=NAME"
+        raise ConfigError(what, where="plan.point", allowed=", ".join(system.point_frames), hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
     inside = FramePositionEvaluator(system, boxed, "plan.frames_in_box") if options.goal == "box" else None

@@ -246,7 +246,9 @@ class MotionToTargetSearch:
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
-            message = f"a better motion may exist. The search ended at plan.max_iterations, {iterations} evaluations"
+            message = (
+                f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
+            )
         return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:

@@ -58,18 +58,12 @@ def _start_frame(recording: Recording, points: Sequence[str], t: Array) -> Array
     """Measured positions (len(points), 3) [m] at the second time, from which predictions without a model start."""
     at, where = recording.point_positions(points, t), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
-        what, allowed = (
-            f"the points {', '.join(points)} have {len(at)} samples only",
-            f"{_GIVEN_FRAMES + 1} samples or more",
-        )
+        what, allowed = f"{', '.join(points)} have {len(at)} samples only", f"{_GIVEN_FRAMES + 1} samples or more"
         raise DataError(what, where=where, allowed=allowed, hint=f"use a longer recording instead of {recording.name}")
     start = np.asarray(at[_GIVEN_FRAMES - 1])
     if not np.all(np.isfinite(start)):
         hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]
-        what, allowed = (
-            f"point '{hidden}' is not seen in sample {_GIVEN_FRAMES}",
-            "a sample with all points of the cable",
-        )
+        what, allowed = f"point '{hidden}' is not seen in sample {_GIVEN_FRAMES}", "a sample with all points"
         hint = f"cut the recording so that it begins when all points are seen, or leave '{hidden}' out"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return start

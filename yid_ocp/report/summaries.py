@@ -338,12 +338,14 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
-    more = f"It is the best of {len(starts)} searches from random motions{others}."
+    more = f"It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
     yield f"The search raised the information of the motion by {gain}. {more}"
     reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"The motion reaches {', and '.join(reached) or 'none of its limits'}."
-    yield from (f"No sensor observes {n} in any motion (to first order); {w}." for n, w in result["unseen"].items())
+    for words in dict.fromkeys(result["unseen"].values()):
+        names = ", ".join(name for name, own in result["unseen"].items() if own == words)
+        yield f"No sensor observes {names} in any of the motions tried: {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
@@ -385,6 +387,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
     ended = "No problem was found, so a run is possible."
+    if not result["recordings"]:
+        ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
     if result.get("issues") or result["warnings"]:
         ended = f"A run is possible, but read the {'issues' if result.get('issues') else 'warnings'} above."
     yield SummaryStatement(ended, "conclusion")
@@ -412,20 +416,21 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
-        "Equations: those of a step that contain the parameter; the last tables explain their names. Observed: those of "
-        "them to which a sensor reacts. [std]: change per unit of the parameter, in stds of noise, of one reading after "
-        f"equilibrium ({seconds:.2g} s) or of all recorded readings."
+        "Equations: those of a step that contain the parameter; a table below explains their names. Observed: those to "
+        "which a sensor reacts. [std]: change per unit of the parameter, in stds of noise, of one reading within "
+        f"{seconds:.2g} s from equilibrium, or of all recorded readings."
     )
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     moved = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     sizes = {n: abs(result["parameters"][n]["value"]) for n in moved}
     lost = [n for n, along in moved.items() if sizes[n] and along * sizes[n] * MAX_WEAK_RELATIVE_STD < 1]
-    said = f"The recordings cannot determine {', '.join(lost)} near these values: even if all else were known, the ± would "
-    yield SummaryStatement(f"{said}exceed {MAX_WEAK_RELATIVE_STD:g} times the value." if lost else "", "verdict")
+    most = f"even if all else were known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value"
+    text = f"The recordings cannot determine {', '.join(lost)} near these values: {most}." if lost else ""
+    yield SummaryStatement(text, "verdict")
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "The column 'observed equations' is left out, because it can be computed only at an equilibrium."
+        yield "The column 'observed equations' is left out: it can be computed only at an equilibrium."
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."

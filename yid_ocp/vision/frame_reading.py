@@ -138,12 +138,11 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        what = f"several topics may have the intrinsics of the camera: {', '.join(nearest)}"
-        what = what if nearest else "the bag has no topic with the intrinsics of the camera"
+        found = f"several topics: {', '.join(nearest)}" if nearest else "no topic"
+        what = f"the intrinsics of the camera are unknown, because the bag has {found}"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
-        hint = (
-            f"record {beside_it}/camera_info as well, or write a folder of frames whose camera.json has the intrinsics"
-        )
+        fix = "keep one of them" if nearest else f"record {beside_it}/camera_info as well"
+        hint = f"{fix}, or write a folder of frames whose camera.json has the intrinsics"
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
     info = _first(bag, nearest[0])
     # ROS 1 spells them with a capital

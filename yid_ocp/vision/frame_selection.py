@@ -212,13 +212,13 @@ def _none_good(
     of_cause = {
         "time stamp is": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
-        "from end to end": _hint(sizes, things, "tighten track.options.filters, or loosen them if a part is missing"),
-        "dense enough": _hint(sizes, things, "check track.point_cloud_unit, and loosen track.options.filters"),
+        "from end to end": "tighten track.options.filters, or loosen them if a part is missing",
+        "dense enough": "check track.point_cloud_unit, and loosen track.options.filters",
         "cannot be used": "copy or export the damaged files again",
         "crosses or touches itself": "record the object without crossings and contacts of its parts",
     }
     hints = [own for words, own in of_cause.items() if any(words in reasons[0] for reasons in often)]
-    hint = "; ".join(hints) or _hint(sizes, things, hint)
+    hint = _hint(sizes, things, "; ".join(hints) or hint)
     what = ". ".join([f"{cause}no frame could be used", *(x + own[0] for x, own in zip(starts, often, strict=True))])
     return DataError(what, where=source, allowed="one usable frame or more", hint=hint)
 

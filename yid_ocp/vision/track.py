@@ -134,13 +134,8 @@ class SingleFrameTracker:
         if scene.robot_urdf is not None:
             robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
-                what, where = (
-                    "no link that the model's joints move has a mesh or shape in this URDF",
-                    str(scene.robot_urdf),
-                )
-                allowed = (
-                    "a URDF with meshes or shapes of moved links, by which `track` removes the arm from the clouds"
-                )
+                what, where = "no link that the model's joints move has a mesh in this URDF", str(scene.robot_urdf)
+                allowed = "a URDF with meshes of moved links, by which `track` removes the arm from the clouds"
                 hint = "set model.robot to a URDF with meshes, or correct model.arms.joints"
                 raise ModelError(what, where=where, allowed=allowed, hint=hint)
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}

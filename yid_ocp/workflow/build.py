@@ -215,11 +215,11 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
                 low, high = max(lower, entry.lower) / factor, min(upper, entry.upper) / factor
-                numbers = f"[{low:g}, {high:g}]".replace("inf", ".inf") if low <= high else "two of the allowed numbers"
-                hint = f"set parameters.{key}.bounds to {numbers}"
-                fault = f"too {'low' if lower < entry.lower else 'high'}"
+                fault, hint = f"too {'low' if lower < entry.lower else 'high'}", "use two of the allowed numbers"
                 if lower > upper:
                     fault, hint = "reversed", "exchange the numbers"
+                elif low <= high:
+                    hint = f"set parameters.{key}.bounds to [{low:g}, {high:g}]".replace(" inf", " .inf")
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are {fault}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed, hint=hint)

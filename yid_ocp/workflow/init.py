@@ -104,12 +104,8 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
     for name, number in ((n, x) for n, x in numbers.items() if x is not None and not 0 < x < math.inf):
         unit = "kg" if name == "mass" else "m" if name in ("length", "radius") else "SI unit"
         what, flag = f"the {name} is {number:g}, not above 0", f"--number {name}=" if name in known else f"--{name} "
-        raise ConfigError(
-            what,
-            where=flag.strip(" ="),
-            allowed=f"a number above 0 [{unit}]",
-            hint=f"measure it, and write {flag}NUMBER",
-        )
+        allowed, hint = f"a number above 0 [{unit}]", f"measure it, and write {flag}NUMBER"
+        raise ConfigError(what, where=flag.strip(" ="), allowed=allowed, hint=hint)
     given = {**numbers, **{name: getattr(arguments, name) for name in ("section", "branch", "branches")}}
     if given["branch"] and not template.has_branches:
         what, hint = f"the object '{word}' has no branches", "write --object tree, or leave --branch out"

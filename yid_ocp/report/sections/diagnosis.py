@@ -112,14 +112,14 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     sentences = [
         f"Most probably the gap of the {_NOMINAL_LABEL} comes from {origin}.",
         gap_locations_sentence(finding),
-        f"There is no gap at {noticed}: it would have been detected there." if noticed else "",
+        f"Nothing is wrong at {noticed}: a gap would have been detected there." if noticed else "",
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
         f"The effects leave a gap, mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
-        "To find this, the analysis adds unknowns that may change over time: forces and offsets of grasps (mechanics), "
-        "and biases of measured points (sensors). It keeps the fewest that explain the residual. These explain "
+        "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
+        "change over time, are added to the model, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
-        f"{evidence['plant']:.4g} with forces and offsets alone, by {evidence['sensor']:.4g} with biases alone, and by "
-        f"{evidence['both']:.4g} with both. A rise of 5 means odds of 150 to 1.",
+        f"{evidence['plant']:.4g} with mechanics alone, by {evidence['sensor']:.4g} with sensors alone, and by "
+        f"{evidence['both']:.4g} with both. An alternative that is lower by 5 has odds of 1 to 150.",
     ]
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
