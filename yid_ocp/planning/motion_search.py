@@ -226,8 +226,7 @@ class MotionToTargetSearch:
         and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
         """
         low, high = lower.ravel(), upper.ravel()
-        x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
-        pull = np.zeros((2, len(self._unit)))
+        x, pull = np.clip(start.ravel(), low + 1e-9, high - 1e-9), np.zeros((2, len(self._unit)))
         penalty, before, ended = _INITIAL_PENALTY, np.inf, False
         for _ in range(_MAX_OUTER_ITERATIONS):
             value, slope = (functools.partial(self._penalised, pull, penalty, part) for part in (0, 1))
@@ -246,9 +245,7 @@ class MotionToTargetSearch:
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
-            message = (
-                f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
-            )
+            message = f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
         return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
@@ -432,8 +429,7 @@ class InformativeMotionSearch:
     def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
         """The best step of the linearised problem within a trust region, shortened until the true limits hold."""
         value, slope = bounded
-        reach = np.abs(slope).sum(1) * radius
-        shift = np.zeros_like(value)
+        reach, shift = np.abs(slope).sum(1) * radius, np.zeros_like(value)
         for _ in range(1 + _MAX_LIMIT_CORRECTIONS):
             high, low = self._high - _LIMIT_SLACK - value - shift, value + shift - self._low - _LIMIT_SLACK
             near_high, near_low = np.flatnonzero(reach > high), np.flatnonzero(reach > low)

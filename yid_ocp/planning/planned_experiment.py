@@ -24,14 +24,7 @@ from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_sta
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_merged_calls
-from yid_ocp.planning.joint_paths import (
-    FramePositionEvaluator,
-    PathSimulator,
-    PlanOptions,
-    RestToRestSplineBasis,
-    solve_start_equilibrium,
-    start_joint_positions_as_array,
-)
+from yid_ocp.planning import joint_paths
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
@@ -52,12 +45,15 @@ class SplineMotionExperiment:
 
     configured_problem: EstimationProblem  # from the settings; its first recording defines sensors, noise and rates
     parameter_values: Mapping[str, float]  # values at which sensitivities are computed
-    simulator: PathSimulator  # simulator of the same system with prescribed arms
+    simulator: joint_paths.PathSimulator  # simulator of the same system with prescribed arms
     free_parameters: tuple[str, ...]  # parameters of the problem, and amplitudes of effects to discriminate
 
     @staticmethod
     def from_options(
-        problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
+        problem: EstimationProblem,
+        values: Mapping[str, float],
+        options: joint_paths.PlanOptions,
+        names: Sequence[str] = (),
     ) -> SplineMotionExperiment:
         """Make a planned experiment from plan options, at parameter `values` and with the free parameters `names`.
 
@@ -80,9 +76,11 @@ class SplineMotionExperiment:
         theta = step.system.parameters.vector(known)
         first = np.array(episode.initial_known_coordinates)
         if options.start_joint_positions is not None:
-            first = start_joint_positions_as_array(step.system, options.start_joint_positions)
-        path = RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
-        mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
+            first = joint_paths.start_joint_positions_as_array(step.system, options.start_joint_positions)
+        path = joint_paths.RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
+        mover = joint_paths.PathSimulator(
+            step, theta, joint_paths.solve_start_equilibrium(step, theta, first), path, options.hold_duration
+        )
         _check_long_enough(problem, float(mover.node_times[-1]))
         return SplineMotionExperiment(problem, known, mover, tuple(names) or problem.free)
 
@@ -120,7 +118,7 @@ class SplineMotionExperiment:
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
 
     def _seen(
-        self, samples: SensorMeasurements, frames: FramePositionEvaluator, q: Array, fastest: float
+        self, samples: SensorMeasurements, frames: joint_paths.FramePositionEvaluator, q: Array, fastest: float
     ) -> PointGroup:
         """Points of one sensor along the motion, with the same information per second as in the recording."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
@@ -140,10 +138,10 @@ class SplineMotionExperiment:
         return PointGroup(*points, times, places, std.copy(), group.sensor_name, camera_pose=group.camera_pose)
 
     @cached_property
-    def _points(self) -> list[tuple[SensorMeasurements, FramePositionEvaluator]]:
+    def _points(self) -> list[tuple[SensorMeasurements, joint_paths.FramePositionEvaluator]]:
         system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
         seen = [samples for samples in measured if samples.sensor.point_names]
-        return [(samples, FramePositionEvaluator(system, samples.sensor.frame_names)) for samples in seen]
+        return [(samples, joint_paths.FramePositionEvaluator(system, samples.sensor.frame_names)) for samples in seen]
 
     def _options(self, **changes: object) -> ProblemOptions:
         """The problem's options for the planned recording alone, which holds the noise of its points."""
@@ -250,8 +248,7 @@ class SplineMotionExperiment:
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
-        jacobian = self._relative(moved, evaluation)
-        offsets = self._offsets
+        jacobian, offsets = self._relative(moved, evaluation), self._offsets
         whole = np.hstack([np.pad(jacobian, ((0, len(offsets) - len(jacobian)), (0, 0))), offsets])
         vectors, taken = self._blur
         data = len(vectors)

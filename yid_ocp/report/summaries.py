@@ -234,7 +234,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     elif result["at"] == "initial":
         names = ", ".join(result["profiles"])
-        yield f"The values are initial ones, but the interval of {names} belongs to a fit from there. Omit --initial."
+        yield f"The values are initial ones, but the interval of {names} belongs to a fit. For both, omit --initial."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]")]
@@ -411,8 +411,8 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
 def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
-    equations, linear = result["equations"], result["linearisation"]
-    size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {equations['sizes']['m']}."
+    m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
+    size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {m}."
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     yield (
@@ -421,12 +421,12 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         f"{seconds:.2g} s from equilibrium, or of all recorded readings."
     )
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
-    moved = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
-    sizes = {n: abs(result["parameters"][n]["value"]) for n in moved}
-    lost = [n for n, along in moved.items() if sizes[n] and along * sizes[n] * MAX_WEAK_RELATIVE_STD < 1]
+    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
+    values = {n: abs(result["parameters"][n]["value"]) for n in changes}
+    lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     most = f"even if all else were known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value"
-    text = f"The recordings cannot determine {', '.join(lost)} near these values: {most}." if lost else ""
-    yield SummaryStatement(text, "verdict")
+    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: {most}."
+    yield SummaryStatement(text if lost else "", "verdict")
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
@@ -440,14 +440,9 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
-    sizes = [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
-    yield SummaryTable([("function", "operations", "nonzeros"), *sizes], "Functions")
     for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
         parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
         yield SummaryTable([(head, "number", "first", "meaning"), *parts], head.capitalize())
-    yield from _patterns(result)
-    norms = [(name, f"{norm:.4g}") for name, norm in linear["norms"].items()]
-    yield SummaryTable([("matrix", "norm"), *norms], "Linearised step")
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
@@ -458,7 +453,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 _INSPECTION_FILES = (
     ("file", "holds"),
     ("linearisation.h5", "the matrices"),
-    ("result.json", "the equations that contain each parameter"),
+    ("sparsity.png", "their entries that can be nonzero"),
+    ("result.json", "the equations that contain each parameter; sizes of functions and matrices"),
     ("equations.txt", "all equations and names"),
 )
 
@@ -489,16 +485,6 @@ def _row_names_text(names: Sequence[str]) -> str:
     text, kinds = abbreviated_names_text(names), [name.partition("[")[0] for name in names]
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
-
-
-def _patterns(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    rows: TableRows = [("matrix", "size", "possible nonzeros", "nonzeros at this point", "picture")]
-    for name, entry in result["patterns"].items():
-        height, width = entry["shape"]
-        if height and width:
-            counts = (str(entry["nonzeros"]), str(entry["at_point"]))
-            rows.append((name, f"{height} x {width}", *counts, "sparsity.png"))
-    yield SummaryTable(rows, "Patterns")
 
 
 @register_summary("yid-simulate/1")

@@ -61,8 +61,7 @@ class MultisineMotion:
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
         wave, rate, bend = sine.sum(1), (omega * cosine).sum(1), -(omega**2 * sine).sum(1)
         s = min(t / self.ramp_time, 1.0)
-        r = s**3 * (10 - 15 * s + 6 * s**2)
-        dr = 30 * s**2 * (1 - s) ** 2 / self.ramp_time
+        r, dr = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / self.ramp_time
         ddr = 60 * s * (1 - s) * (1 - 2 * s) / self.ramp_time**2
         return r * wave, dr * wave + r * rate, ddr * wave + 2 * dr * rate + r * bend
 
@@ -102,8 +101,7 @@ def random_multisine_motion(
     Amplitudes decrease with frequency (as 1/frequency) and towards the base. Defaults: `values` are nominal, initial
     angles [rad or m] come from `grasping_joint_angles`. Without grasps, joints reach `max_joint_speed`.
     """
-    chosen = excitation or MultisineOptions()
-    rng = np.random.default_rng(seed)
+    chosen, rng = excitation or MultisineOptions(), np.random.default_rng(seed)
     shape = len(system.driven), chosen.sines_per_joint
     frequency, phase = _drawn_frequencies(chosen.frequency_band, shape, rng), rng.uniform(0.0, 2 * math.pi, shape)
     amplitude = rng.uniform(0.7, 1.3, shape) / frequency
@@ -113,8 +111,7 @@ def random_multisine_motion(
     motion = MultisineMotion(system.driven, amplitude, frequency, phase, chosen.ramp_time)
     times = np.linspace(0.0, chosen.duration, 251)
     start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
-    tree = system.mechanism_with_values(values)
-    q0 = np.zeros(system.n_coordinates)
+    tree, q0 = system.mechanism_with_values(values), np.zeros(system.n_coordinates)
     q0[[tree.joint_index(name) for name in start]] = list(start.values())
     holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
     chains = [tree.ancestor_joint_indices(frame.joint_index) for frame in holders]
@@ -157,8 +154,7 @@ def _shaken(
     """The motion with fast sines added. `inertia` (nj,) is that of the driven joints [kg m^2]."""
     shape = motion.frequency.shape
     frequency = _drawn_frequencies(excitation.shake_frequency_band, shape, rng)
-    omega = 2 * math.pi * frequency
-    torque = excitation.shake_torque_rms * math.sqrt(2.0 / shape[1])
+    omega, torque = 2 * math.pi * frequency, excitation.shake_torque_rms * math.sqrt(2.0 / shape[1])
     amplitude = np.minimum(torque / (inertia[:, None] * omega**2), excitation.max_shake_speed / omega)
     phase = np.hstack([motion.phase, rng.uniform(0.0, 2 * math.pi, shape)])
     amplitude, frequency = np.hstack([motion.amplitude, amplitude]), np.hstack([motion.frequency, frequency])
@@ -206,8 +202,7 @@ def grasping_joint_angles(
         Position of each gripper relative to the grasped point of the undeformed object, in the world [m]. Two arms that
         hold the undeformed Y are fully stretched, a singular posture. Offsets that bring the grippers closer avoid it.
     """
-    tree = system.mechanism_with_values(values)
-    value = CasadiEvaluator(system, values)
+    tree, value = system.mechanism_with_values(values), CasadiEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}
     holders = (tree.frame(grasp.holder_frame).joint_index for grasp in system.grasps)
@@ -237,8 +232,7 @@ def _gap_function(
 ) -> ca.Function:
     """Function of q: gaps [m] between grippers and the held points, and their derivatives by the searched joints."""
     q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(tree, q)
-    gaps = []
+    kinematics, gaps = forward_kinematics(tree, q), []
     for grasp in system.grasps:
         offset = Placement(ca.SX(ca.DM.eye(3)), ca.SX(ca.DM(value(grasp.holder_offset))))
         beside = ca.DM(np.asarray(offsets.get(grasp.name, np.zeros(3)), float))

@@ -462,11 +462,11 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
-            what, key = (
-                f"MuJoCo cannot express the servo's dead band of '{joint}'",
-                f"parameters.{joint}.servo_dead_band",
+            key, what = (
+                f"parameters.{joint}.servo_dead_band.initial",
+                f"MuJoCo lacks the servo's dead band of '{joint}'",
             )
-            raise ModelError(what, where=f"{key}.initial", allowed="0", hint=f"add --set {key}.initial=0")
+            raise ModelError(what, where=key, allowed="0", hint=f"add --set {key}=0")
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
         what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave the effect on the clock out"
         raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)

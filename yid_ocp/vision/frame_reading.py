@@ -141,8 +141,8 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
         found = f"several topics: {', '.join(nearest)}" if nearest else "no topic"
         what = f"the intrinsics of the camera are unknown, because the bag has {found}"
         allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
-        fix = "keep one of them" if nearest else f"record {beside_it}/camera_info as well"
-        hint = f"{fix}, or write a folder of frames whose camera.json has the intrinsics"
+        hint = "keep one of them" if nearest else f"record {beside_it}/camera_info as well"
+        hint += ", or write a folder of frames whose camera.json has the intrinsics"
         raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
     info = _first(bag, nearest[0])
     # ROS 1 spells them with a capital

@@ -134,11 +134,9 @@ def mark_outlying_frames_as_dropped(frames: Sequence[FrameReport], grasped: Sequ
     if not fits:
         return list(frames)
     limit = _MAX_DISTANCE_OVER_MEDIAN * float(np.median([fit.mean_distance for fit in fits.values()]))
-    gap = np.median([fit.grasp_gaps for fit in fits.values()], axis=0)
-    made = list(frames)
+    gap, made = np.median([fit.grasp_gaps for fit in fits.values()], axis=0), list(frames)
     for k, fit in fits.items():
-        reason = ""
-        shifts = np.linalg.norm(fit.grasp_gaps - gap, axis=1)
+        reason, shifts = "", np.linalg.norm(fit.grasp_gaps - gap, axis=1)
         apart = float(shifts.max(initial=0.0))
         if fit.mean_distance > limit:
             off = f"points are {1e3 * fit.mean_distance:.1f} mm from it on average, but only {1e3 * limit:.1f} mm are"

@@ -290,8 +290,7 @@ class SingleFrameTracker:
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
             return work.report
-        begun = time.process_time()
-        shape = self._shape(common.dimensions)
+        begun, shape = time.process_time(), self._shape(common.dimensions)
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
         reason = frame_selection.frame_rejection_reason(fits[0], shape, self.options)

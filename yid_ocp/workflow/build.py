@@ -118,8 +118,7 @@ def urdf_reader_arguments(run: RunSettings) -> dict[str, Any]:
 
 def build_step(run: RunSettings, system: System | None = None) -> Step:
     """Compile the discrete Euler-Lagrange step of a run's system."""
-    said = run.problem
-    system = build_system(run) if system is None else system
+    said, system = run.problem, build_system(run) if system is None else system
     return compile_step(
         system, said.time_step_or_10_ms, said.force_split, said.constraint_force_at, use_compiler=said.use_compiler
     )
@@ -215,11 +214,9 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
                 low, high = max(lower, entry.lower) / factor, min(upper, entry.upper) / factor
-                fault, hint = f"too {'low' if lower < entry.lower else 'high'}", "use two of the allowed numbers"
-                if lower > upper:
-                    fault, hint = "reversed", "exchange the numbers"
-                elif low <= high:
-                    hint = f"set parameters.{key}.bounds to [{low:g}, {high:g}]".replace(" inf", " .inf")
+                fault = "reversed" if lower > upper else "too low" if lower < entry.lower else "too high"
+                hint = f"set parameters.{key}.bounds to [{low:g}, {high:g}]".replace(" inf", " .inf")
+                hint = "exchange the numbers" if lower > upper else hint if low <= high else "use allowed numbers"
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are {fault}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed, hint=hint)

@@ -27,14 +27,8 @@ from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefitStore, Re
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
+from yid_ocp.inference import uncertainty
 from yid_ocp.inference.smoother import smoothed_unknown_units
-from yid_ocp.inference.uncertainty import (
-    ParameterEstimate,
-    covariance_to_dict,
-    typical_parameter_magnitudes,
-    unknowns_covariance_and_reduced_chi2,
-    verdict_by_relative_std,
-)
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.parallel import return_freed_memory
 from yid_ocp.problem import EstimationProblem
@@ -143,8 +137,10 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
             free = entry.name in shared
             std = files.to_json_types(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
-    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
-    covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
+    matrix, _ = uncertainty.unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
+    covariance = uncertainty.covariance_to_dict(
+        shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared]
+    )
     return {"parameters": found, "covariance": covariance}
 
 
@@ -154,13 +150,13 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     A parameter of an accepted effect also counts as found if it is only weakly determined.
     """
     fit, system = finding.final_model, finding.final_model.problem.system
-    sizes, estimates = typical_parameter_magnitudes(fit.problem, fit.unknowns), {}
+    sizes, estimates = uncertainty.typical_parameter_magnitudes(fit.problem, fit.unknowns), {}
     for name in fit.problem.shared_parameters:
         entry, value, std = system.parameters[name], fit.values[name], fit.std[name]
-        verdict = verdict_by_relative_std(value, std, sizes[name])
+        verdict = uncertainty.verdict_by_relative_std(value, std, sizes[name])
         verdict = "identifiable" if verdict == "weak" and "@" in name else verdict
         told = entry.unit, entry.value, entry.lower, entry.upper
-        estimates[name] = ParameterEstimate(value, std, *told, True, verdict)
+        estimates[name] = uncertainty.ParameterEstimate(value, std, *told, True, verdict)
     effects = [f"  - {{kind: {own.kind}, location: {own.location}}}" for own in finding.accepted_effects]
     lines = ["model:", "  effects:  # add them to those of the configuration", *effects] if effects else []
     stated, used = finding.stated_and_used_time_step

@@ -12,13 +12,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.analysis import run_estimates
 from yid_ocp.analysis.discretisation import EXTRAPOLATION_FACTOR
-from yid_ocp.analysis.run_estimates import (
-    DriftAndOutlierTestResults,
-    RunEstimates,
-    assess_drift_and_outlier_runs,
-    pool_estimates_and_chi2,
-)
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import RENAMED_NAMES_HINT
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
@@ -49,7 +44,7 @@ _COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "joint_springs",
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 
 
-def read_estimates(folder: str | Path) -> RunEstimates:
+def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
     """Read the estimates and covariance of free parameters from the run folder of a `solve` or `diagnose`.
 
     Raises `DataError` without a finished run, or for a result that is unreadable, old, of another command, or failed.
@@ -80,7 +75,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)
-    return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
+    return run_estimates.RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -132,9 +127,9 @@ def read_result_file(file: Path) -> dict[str, Any]:
     return result
 
 
-def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
+def estimates_of_each_baseline_run(run: RunSettings) -> tuple[run_estimates.RunEstimates, ...]:
     """Read the estimates of the baseline runs. Raises `ConfigError` if one has another model or is listed twice."""
-    found: list[RunEstimates] = []
+    found: list[run_estimates.RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline_run_folders):
         where = ("diagnosis", "baseline_run_folders", i)
         try:
@@ -199,11 +194,11 @@ def _settings(folder: str | Path) -> RunSettings | None:
     return load_config(file) if is_file(file) else None
 
 
-def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
+def settings_with_baseline_effects(run: RunSettings, runs: Sequence[run_estimates.RunEstimates]) -> RunSettings:
     """Return settings with the effects of the baseline `runs` at their estimated values, and these parameters free."""
     if not runs:
         return run
-    known, _, _ = pool_estimates_and_chi2(runs)
+    known, _, _ = run_estimates.pool_estimates_and_chi2(runs)
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     estimated = group_parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
@@ -234,7 +229,10 @@ def recordings_without_effect_or_reason(run: RunSettings) -> tuple[tuple[Recordi
 
 
 def require_recordings_not_in_baseline(
-    run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
+    run: RunSettings,
+    problem: EstimationProblem,
+    runs: Sequence[run_estimates.RunEstimates],
+    without: Sequence[Recording],
 ) -> None:
     """Raise `ConfigError` if a recording of the run is in `without`: those of the baseline or the reference."""
     known = {other.sha256 for other in without} - {None}
@@ -268,7 +266,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     estimates = [replace(read_estimates(path), run_name=label) for path, label in zip(paths, labels, strict=True)]
     require_runs_of_one_model(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
-    told = run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(estimates))
+    told = run_drift_and_outliers_to_dict(run_estimates.assess_drift_and_outlier_runs(estimates))
     settings = RunSettings(name="history", description="Runs of one model side by side.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
@@ -277,7 +275,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     return CommandOutcome(folder.path, written, None)
 
 
-def run_drift_and_outliers_to_dict(found: DriftAndOutlierTestResults) -> dict[str, Any]:
+def run_drift_and_outliers_to_dict(found: run_estimates.DriftAndOutlierTestResults) -> dict[str, Any]:
     """Convert drift and outlier tests of several runs to a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drift_tests:
