@@ -214,8 +214,7 @@ def _scenarios(
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
     slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
-    moved = np.linalg.norm((slope @ axes).reshape(-1, axes.shape[1]), axis=0)
-    found = []
+    moved, found = np.linalg.norm((slope @ axes).reshape(-1, axes.shape[1]), axis=0), []
     for k in np.argsort(-moved)[:2]:
         for sign in (-1.0, 1.0):
             theta = mover.theta.copy()

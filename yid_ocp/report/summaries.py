@@ -338,9 +338,9 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
-    more = f"It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
+    more = f" It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
-    yield f"The search raised the information of the motion by {gain}. {more}"
+    yield f"The search raised the information of the motion by {gain}.{more}"
     reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     yield f"The motion reaches {', and '.join(reached) or 'none of its limits'}."
     for words in dict.fromkeys(result["unseen"].values()):

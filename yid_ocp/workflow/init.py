@@ -188,7 +188,7 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "object held by" if proposal.has_object else "no object is given; a payload is assumed at"
+    carried = "object held by" if proposal.has_object else "no object is given; an unknown payload is modelled at"
     lines = [
         f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
         f"{carried}: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),

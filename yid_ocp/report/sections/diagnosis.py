@@ -58,8 +58,7 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     changed = bool(finding.accepted_effects)
-    floor = {own.channel: own.noise_rmse for own in finding.noise_floor}
-    rows = []
+    floor, rows = {own.channel: own.noise_rmse for own in finding.noise_floor}, []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
         values = {_NOMINAL_LABEL: (factor * error, None)}
