@@ -21,6 +21,7 @@ from yid_ocp.inference.null_test import (
     channels_with_residual_indices,
     residual_chi2_null_test,
     residuals_exceed_noise,
+    whiten_with_drawn_errors,
     whiten_with_extra_errors,
 )
 from yid_ocp.inference.uncertainty import (
@@ -497,6 +498,16 @@ def test_what_other_errors_did_is_whitened_and_the_rest_left_as_it_is():
     spread = np.array([[2.0, math.inf], [0.0, 1.0]])
     np.testing.assert_allclose(whiten_with_extra_errors(np.array([3.0, 5.0]), spread), [3.0 / math.sqrt(5.0), 5.0])
     np.testing.assert_array_equal(whiten_with_extra_errors(np.array([3.0]), np.array([[math.nan]])), [3.0])
+
+
+def test_what_few_draws_of_an_error_leave_counts_as_noise():
+    rng = np.random.default_rng(3)  # 32 draws show a third of 100 directions
+    ways, none = np.linalg.qr(rng.standard_normal((2000, 100)))[0] * 3.0, np.zeros((2000, 0))
+    drawn = ways @ rng.standard_normal((100, 32)) / np.sqrt(32)
+    seen = rng.standard_normal(2000) + ways @ rng.standard_normal(100)
+    assert np.mean(whiten_with_extra_errors(seen, drawn) ** 2) > 1.15
+    assert np.mean(whiten_with_drawn_errors(seen, none, drawn) ** 2) == pytest.approx(1.0, abs=0.06)
+    assert whiten_with_drawn_errors(seen, none, none) == pytest.approx(seen)
 
 
 PER_WINDOW = 20

@@ -498,7 +498,7 @@ def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limit
 
 def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
     spread = null_test.encoder_noise_residual_covariance_factor(fit.problem, fit.unknowns)
-    residual = null_test.whiten_with_extra_errors(fit.evaluation.residual, spread)
+    residual = null_test.whiten_with_drawn_errors(fit.evaluation.residual, spread[:, :0], spread)
     return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
 
 
@@ -530,5 +530,5 @@ def _held_out_null_test_and_spread(
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
     by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, fit.evaluation)[:shared])
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
-    residual = null_test.whiten_with_extra_errors(residual, np.hstack([by_parameters, by_path]))
+    residual = null_test.whiten_with_drawn_errors(residual, by_parameters, by_path)
     return _null_test(own, residual, 0, limits), by_parameters

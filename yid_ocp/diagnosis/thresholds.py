@@ -15,10 +15,7 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The thresholds for every step of a diagnosis, from the null test to the events.
-
-    Each field has a description, repeated in the section `diagnosis` of the settings reference.
-    """
+    """The thresholds for every step of a diagnosis. The section `diagnosis` of the settings reference has them all."""
 
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("smallest rise of the log evidence for which a group of unknowns is selected")

@@ -112,10 +112,7 @@ class Judgement:
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
     def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
-        """Return this judgement if changes explain as much, with the BIC of the changes minus that of the effects.
-
-        The difference of the BIC is divided by the threshold (`select.bic_difference_per_threshold`).
-        """
+        """Return this judgement if changes explain as much (BIC difference: `select.bic_difference_per_threshold`)."""
         share = select.relative_probability(bic_difference)
         rivals, probability = tuple(names), self.probability * share
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
@@ -129,8 +126,7 @@ class Judgement:
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
         """The fraction of the gap that accepted effects at each location close beyond the effects added before."""
-        closed: dict[str, float] = {}
-        most = 0.0
+        closed, most = dict[str, float](), 0.0
         for entry in self.accepted_selected_effects:
             place, part = entry.effect.location, entry.cumulative_closure.fraction
             closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)

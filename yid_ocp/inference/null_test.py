@@ -25,7 +25,7 @@ from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
-_N_PATH_NOISE_DRAWS = 32  # draws of encoder noise, which give the variance of a score to a quarter
+_N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise, which give the variance of a score to a quarter; folds
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
@@ -138,6 +138,21 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 
+def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Array:
+    """Whiten a residual (nr,) for errors of the factors `known` (nr, k) and, from K random draws, `drawn` (nr, K).
+
+    Few draws whiten another in part only. The residual is divided by the rms of noise that other folds have whitened.
+    """
+    rng, used, (count, total) = np.random.default_rng(0), residual != 0, (drawn.shape[1], 0.0)
+    for fold in np.array_split(np.arange(count), _N_FOLDS):
+        others = np.hstack([known, np.delete(drawn, fold, axis=1) * math.sqrt(count / max(count - len(fold), 1))])
+        for one in drawn[:, fold].T * math.sqrt(count):
+            one += used * rng.standard_normal(len(one)) + np.nan_to_num(known) @ rng.standard_normal(known.shape[1])
+            total += float(np.sum(whiten_with_extra_errors(one, others) ** 2))
+    rms = math.sqrt(total / max(count * np.count_nonzero(used), 1)) or 1.0
+    return whiten_with_extra_errors(residual, np.hstack([known, drawn])) / rms
+
+
 def encoder_noise_residual_covariance_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:
@@ -147,12 +162,8 @@ def encoder_noise_residual_covariance_factor(
     returns the residual of a problem, here with redrawn noise, or None if it fails; default: the residual at `x`. K is
     0 if no prescribed joint moves an object, or no points are measured.
     """
-
-    def evaluated(own: EstimationProblem) -> Array | None:
-        found = own.evaluate(x, False)
-        return found.residual if found.ok else None
-
-    residual_of, nothing = predicted or evaluated, np.zeros((problem.residual_rows.weak_priors.stop, 0))
+    residual_of = predicted or (lambda own: seen.residual if (seen := own.evaluate(x, False)).ok else None)
+    nothing = np.zeros((problem.residual_rows.weak_priors.stop, 0))
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
     rows = [c.residual_indices for c in channels_with_residual_indices(problem) if c.group in points]
     moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
