@@ -142,12 +142,12 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
         result: dict[str, Any] = {}
         for key, value in node.items():
             name = str(key)
-            places[(*path, name)] = f"{origin}, line {_line(node, key)}"
+            places[(*path, name)] = _place(node, key, origin)
             result[name] = _unwrap(value, (*path, name), places, origin)
         return result
     if isinstance(node, CommentedSeq):
         for i in range(len(node)):
-            places[(*path, i)] = f"{origin}, line {_line(node, i)}"
+            places[(*path, i)] = _place(node, i, origin)
         return [_unwrap(value, (*path, i), places, origin) for i, value in enumerate(node)]
     if isinstance(node, str) and "\0" in node:
         what, allowed = "the text contains a null character", "text without null characters"
@@ -161,11 +161,12 @@ def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str)
     return node
 
 
-def _line(node: CommentedMap | CommentedSeq, key: Any) -> int:
+def _place(node: CommentedMap | CommentedSeq, key: Any, origin: str) -> str:
     try:
-        return int((node.lc.key(key) if isinstance(node, CommentedMap) else node.lc.item(key))[0]) + 1
+        line = (node.lc.key(key) if isinstance(node, CommentedMap) else node.lc.item(key))[0]
     except (KeyError, TypeError):
-        return int(node.lc.line) + 1
+        line = node.lc.line
+    return origin if origin.startswith("--set ") else f"{origin}, line {int(line) + 1}"
 
 
 def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> None:
