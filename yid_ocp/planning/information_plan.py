@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.analysis.experiment_design import step_and_measurable_points_with_frames
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, require_known_names
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
@@ -287,7 +287,8 @@ def _plan(
         way = "lower plan.limits, or set another plan.start_joint_positions"
         message = f"the result is the best random initial motion. For the search to improve it, {way}"
     elif not chosen.is_converged:
-        message = f"plan.max_iterations ended the search ({chosen.n_iterations} rounds). Raise it or use this motion"
+        rounds = count_with_noun(chosen.n_iterations, "round")
+        message = f"plan.max_iterations ended the search ({rounds}). Raise it or use this motion"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(
