@@ -290,8 +290,7 @@ def test_a_prior_counts_as_stated_where_a_part_of_all_stated_deviations_is_noise
 
 def saturating(top, at):
     """One sample whose prediction saturates: seen where it is small, not where it is large."""
-    slope = lambda x: 1.0 / np.cosh((x[0] - at) / top) ** 2  # noqa: E731
-    return lambda x, duration: (np.array([top * np.tanh((x[0] - at) / top)]), np.array([[slope(x)]]))
+    return lambda x, duration: ((y := top * np.tanh((x[:1] - at) / top)), (1.0 - (y / top) ** 2)[:, None])
 
 
 @pytest.mark.parametrize(
