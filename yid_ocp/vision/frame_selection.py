@@ -212,6 +212,7 @@ def _none_good(
         "not in metres": "set track.point_cloud_unit: mm, or unit: mm in camera.json",
         "from end to end": "tighten track.options.filters, or loosen them if a part is missing",
         "dense enough": "check track.point_cloud_unit, and loosen track.options.filters",
+        "no encoding of depth": "set track.frame_topic to a topic of depth images (16UC1, 32FC1 or mono16)",
         "cannot be used": "copy or export the damaged files again",
         "crosses or touches itself": "record the object without crossings and contacts of its parts",
     }
