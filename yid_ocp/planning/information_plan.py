@@ -282,12 +282,11 @@ def _plan(
     if not np.isfinite(chosen.configured_criterion):
         what, hint = "the model cannot follow any planned motion by its torques", "lower plan.limits.max_acceleration"
         raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
-    w, message = chosen.w, "the motion was found"
+    w, rounds, message = chosen.w, count_with_noun(chosen.n_iterations, "round"), "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "lower plan.limits, or set another plan.start_joint_positions"
         message = f"the result is the best random initial motion. For the search to improve it, {way}"
     elif not chosen.is_converged:
-        rounds = count_with_noun(chosen.n_iterations, "round")
         message = f"plan.max_iterations ended the search ({rounds}). Raise it or use this motion"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
