@@ -501,7 +501,7 @@ def test_what_other_errors_did_is_whitened_and_the_rest_left_as_it_is():
 
 def test_what_few_draws_of_an_error_leave_counts_as_noise():
     rng = np.random.default_rng(3)  # 32 draws show a third of 100 directions
-    ways, none = np.linalg.qr(rng.standard_normal((2000, 100)))[0] * 3.0, np.zeros((2000, 0))
+    ways, none = np.linalg.qr(rng.standard_normal((2000, 100)))[0] * 3.0, np.full((2000, 1), np.inf)
     drawn = ways @ rng.standard_normal((100, 32)) / np.sqrt(32)
     seen = rng.standard_normal(2000) + ways @ rng.standard_normal(100)
     assert np.mean(whiten_with_extra_errors(seen, drawn) ** 2) > 1.15

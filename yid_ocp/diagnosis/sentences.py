@@ -175,8 +175,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
-    sizes = result.undetermined_sizes(limits)
-    unsure = " and ".join(sizes)
+    unsure = " and ".join(sizes := result.undetermined_sizes(limits))
     size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} ± or more from the one without effect"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"

@@ -17,7 +17,7 @@ from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 _UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
-"""Why the verdict is unknown: no candidate helps, too little explained, no transfer."""
+"""Why the verdict is unknown: no candidate helps, too little is explained, or the size is not known."""
 
 _LOGISTIC_OFFSET, _LOGISTIC_SLOPE = -0.2, 0.8  # of the log odds over the logarithm of what is unexplained
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise

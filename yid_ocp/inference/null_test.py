@@ -25,7 +25,7 @@ from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
-_N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise, which give the variance of a score to a quarter; folds
+_N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
@@ -132,10 +132,10 @@ def residual_chi2_null_test(
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
 
-    r (nr,) is `residual`. F (nr, k) is `spread`; column j, if finite, is the change of r by one std of error j.
+    r (nr,) or (nr, m) is `residual`. F (nr, k) is `spread`; column j, if finite, is the change by one std of error j.
     """
     columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
-    return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
+    return np.asarray(residual + (columns * (1 / np.hypot(1.0, sizes) - 1)) @ (columns.T @ residual))
 
 
 def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Array:
@@ -143,14 +143,15 @@ def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Arr
 
     Few draws whiten another in part only. The residual is divided by the rms of noise that other folds have whitened.
     """
-    rng, used, (count, total) = np.random.default_rng(0), residual != 0, (drawn.shape[1], 0.0)
-    for fold in np.array_split(np.arange(count), _N_FOLDS):
+    known, drawn = (own[:, np.isfinite(own).all(axis=0)] for own in (known, drawn))
+    rng, used, (n, count), total = np.random.default_rng(0), residual != 0, drawn.shape, 0.0
+    for fold in np.array_split(np.arange(count), min(_N_FOLDS, count)) if count else ():
         others = np.hstack([known, np.delete(drawn, fold, axis=1) * math.sqrt(count / max(count - len(fold), 1))])
-        for one in drawn[:, fold].T * math.sqrt(count):
-            one += used * rng.standard_normal(len(one)) + np.nan_to_num(known) @ rng.standard_normal(known.shape[1])
-            total += float(np.sum(whiten_with_extra_errors(one, others) ** 2))
-    rms = math.sqrt(total / max(count * np.count_nonzero(used), 1)) or 1.0
-    return whiten_with_extra_errors(residual, np.hstack([known, drawn])) / rms
+        rest = [used * rng.standard_normal(n) + known @ rng.standard_normal(known.shape[1]) for _ in fold]
+        made = math.sqrt(count) * drawn[:, fold] + np.transpose(rest)
+        total += float(np.sum(whiten_with_extra_errors(made, others) ** 2))
+    whole = whiten_with_extra_errors(residual, np.hstack([known, drawn]))
+    return whole / (math.sqrt(total / max(count * np.count_nonzero(used), 1)) or 1.0)
 
 
 def encoder_noise_residual_covariance_factor(

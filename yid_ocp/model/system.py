@@ -470,7 +470,7 @@ def _check_names(
         raise ModelError(what, where="driven and prescribed joints", allowed="one of the two", hint=hint)
     for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
         tree.frame(frame)
-    for one, two in combinations(filter(lambda grasp: grasp.compliance.is_zero(), grasps), 2):
+    for one, two in combinations([grasp for grasp in grasps if grasp.compliance.is_zero()], 2):
         if {one.holder_frame, one.held_frame} == {two.holder_frame, two.held_frame}:
             frames = f"the same two frames, {two.holder_frame} and {two.held_frame}"
             what, hint = f"the grasps '{one.name}' and '{two.name}' constrain {frames}", f"remove '{two.name}'"
