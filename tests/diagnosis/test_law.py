@@ -81,6 +81,16 @@ def test_a_torque_without_a_name_is_found_at_its_joint_as_a_function_of_its_quan
     assert np.all(np.abs(table.torque - true)[inner] < 3 * table.torque_std[inner] + 0.02)
 
 
+def test_an_effect_is_no_surer_than_a_law_of_what_is_left_moves_it(system, urdf_folder):
+    """No candidate is the drag beside the dry friction of 0.3 N m."""
+    runs = [moved(urdf_folder, lambda q, v: -0.3 * np.sign(v) - 0.03 * v * np.abs(v), seed) for seed in range(3)]
+    found = diagnose(problem_of(compile_step(system, H), runs[:2]), ["joint_coulomb"], runs[2:])
+    name, fit, beside = "joint_coulomb@elbow.tau_c", found.final_model, found.law.model.values
+    assert ([own.label for own in found.accepted_effects], found.law.depends_on) == (["joint_coulomb@elbow"], "speed")
+    assert fit.std[name] >= abs(beside[name] - fit.values[name]) > 0.1
+    assert abs(fit.values[name] - 0.3) < 2 * fit.std[name]
+
+
 def test_no_law_is_told_of_recordings_without_a_gap(system, urdf_folder):
     runs = [moved(urdf_folder, lambda q, v: 0.0, seed) for seed in range(3)]
     found = diagnose(problem_of(compile_step(system, H), runs[:2]), ["gravity_tilt"], runs[2:])

@@ -377,7 +377,7 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 
 def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
     _, chosen, found = Rounds(monkeypatch, GROWING).compose(max_effects=1)
-    assert (chosen, found[0].extended_models) == (["a"], ())
+    assert (chosen, [fit.effects[-1].kind for fit in found[0].extended_models]) == (["a"], ["b", "c"])
     rounds = Rounds(monkeypatch, GROWING | {"ab": (3.1, 3.2), "ac": (3.1, 3.2), "bc": (3.1, 3.2)}, pairs=("bc",))
     entry = rounds.compose(max_effects=2)[2][0]
     assert [fit.effects[-1].kind for fit in entry.extended_models] == ["b", "c"]
@@ -540,7 +540,7 @@ def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
     assert "the model now has b@x and c@x (93.9 % of the held-out gap closed)" in rounds.heard.stages
     # from the nominal fit, without those that have the best one in them, which others are tried beside anyway
     assert rounds.refits[2] == (["bc"], 0.0)
-    assert rounds.refits[3:] == EACH_LEFT_OUT, "others are tried in the place of either"
+    assert rounds.refits[3:] == [(["b", "c"], ["a"], 2.0), *EACH_LEFT_OUT], "others beside both and in their place"
 
 
 def test_a_pair_that_is_no_better_or_of_which_one_is_not_there_is_not_taken(monkeypatch):

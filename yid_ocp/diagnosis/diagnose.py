@@ -263,7 +263,8 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
     rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
     before, after = (
-        [_excess_of(r[at]) for at in part] for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
+        [float(r[at] @ r[at]) - np.count_nonzero(r[at]) for at in part]
+        for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
     )
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
@@ -378,13 +379,9 @@ def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     if evaluation.ok:
         with contextlib.suppress(SolverError):
             held_out = [part.residual for part in _held_out_residuals(judged, judged.predict_held_out(x))]
-            return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
+            r = np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out])
+            return float(r @ r) - np.count_nonzero(r)
     return math.inf
-
-
-def _excess_of(residual: Array) -> float:
-    """r'r minus the number of used samples."""
-    return float(residual @ residual) - np.count_nonzero(residual)
 
 
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
@@ -416,7 +413,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
         final, is_counted = _with_errors_of_step_and_encoders(search, final, events)
-        judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
         remaining, rest = _held_out_null_test_and_spread(final, limits)[0], ()
         tests = _estimation_null_test(final, limits), remaining
         if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
@@ -433,6 +429,11 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
     prior = nominal.problem.options.multivariate_prior
     law = find_gap_law(search, problem.with_replaced_multivariate_prior(prior), final, places, seen.events)
+    if accepted:
+        # an estimate is no surer than the law of what is left moves it
+        beside = final.values if law is None else law.model.values
+        final = replace(final, std={k: max(std, abs(beside[k] - final.values[k])) for k, std in final.std.items()})
+        judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")
     ends = search.stage_ends
     finding = DiagnosisResult(
@@ -517,7 +518,8 @@ def _held_out_null_test_and_spread(
 ) -> tuple[NullTestResult, Array]:
     """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
     problem, x, shared = fit.problem, fit.unknowns, len(fit.problem.shared_parameters)
-    own, filters = problem.with_episodes(problem.held_out, ()), problem.held_out_whitening_filters
+    predicted, filters = predicted or problem.predict_held_out(x, True), problem.held_out_whitening_filters
+    own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
 
     def residual_of(moved: EstimationProblem) -> Array | None:
         other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
@@ -525,7 +527,7 @@ def _held_out_null_test_and_spread(
             return np.concatenate([part.residual for part in _held_out_residuals(other, other.predict_held_out(x))])
         return None
 
-    found = _held_out_residuals(problem, predicted or problem.predict_held_out(x, True))
+    found = _held_out_residuals(problem, predicted)
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
     by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, fit.evaluation)[:shared])

@@ -247,8 +247,9 @@ def select_effects(
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
+        # one effect more than allowed only tells how wrong the others may be
         is_full = len(base) >= limits.max_effects
-        if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
+        if _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
         search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
@@ -258,11 +259,11 @@ def select_effects(
             break
         shortlist = _refit_shortlist(seen, limits)
         fits = refit_with_each_effect(search, base, shortlist, better.values)
-        if len(base) == 1:
+        if len(base) == 1 and not is_full:
             pairs = _pairs_to_refit(search, screened, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         later += [fit.statistics() for fit in fits]
-        near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
+        near = [] if is_full else _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before)
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one
