@@ -137,10 +137,12 @@ class _InputCorrectionFunctions:
             "effort_lag": self._with_jacobian([self._lag(f"joints.effort.{joint}") for joint in system.prescribed]),
         }
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
-        outputs = [true_angle, true_effort, ca.densify(slope)]
+        outputs, true = [true_angle, true_effort, ca.densify(slope)], ca.vertcat(true_angle, true_effort)
+        self._correcting = [name for name in names if _depends(true, system.parameters[name].symbol)]
+        chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self._correcting))
 
         def compiled(differentiated: bool) -> MappedFunction:
-            slopes = [ca.jacobian(x, self._chosen) for x in outputs[:2]] if differentiated else []
+            slopes = [ca.jacobian(x, chosen) for x in outputs[:2]] if differentiated else []
             function = ca.Function("true", [angle, effort, theta], [*outputs, *slopes])
             return MappedFunction(function, shared_inputs=(2,), use_compiler=use_compiler)
 
@@ -181,8 +183,10 @@ class _InputCorrectionFunctions:
         derivative of the true effort with respect to the recorded effort.
         """
         a, e, e_reading, *slopes = self._maps(bool(names))(angle, effort, theta)
-        at = [self._names.index(name) for name in names]
-        a_theta, e_theta = (x[:, :, at] for x in slopes) if names else (np.zeros((*a.shape[:2], 0)),) * 2
+        a_theta, e_theta = by_theta = np.zeros((2, *a.shape[:2], len(names)))
+        own = [name for name in self._correcting if name in names]  # few of many
+        for full, slope in zip(by_theta, slopes, strict=False):
+            full[:, :, [names.index(name) for name in own]] = slope[:, :, list(map(self._correcting.index, own))]
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
     def joint_delays_or_lag_times(
@@ -217,8 +221,8 @@ class _InputCorrectionFunctions:
         if function is None:
             return None
         value, slope = (np.array(ca.densify(x)) for x in function(theta))
-        at = [self._names.index(name) for name in wanted]
-        return value.ravel(), slope.reshape(value.size, len(self._names))[:, at]
+        slope = slope.reshape(value.size, len(self._names))[:, [self._names.index(name) for name in wanted]]
+        return (value.ravel(), slope) if value.any() or slope.any() else None
 
 
 def _depends(expression: ca.SX, symbols: ca.SX) -> bool:

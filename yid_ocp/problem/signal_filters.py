@@ -67,13 +67,7 @@ class ZeroPhaseLowPassFilter:
         The filter does not use the value at node 0. The signal is constant before node 1 and after the last node.
         """
         nodes = nodes[nodes < count]
-        weight = _weights(self, step)
-        reach = len(weight) // 2
-        column = np.clip(nodes[:, None] + np.arange(-reach, reach + 1), 1, count - 1)
-        row = np.broadcast_to(np.arange(len(nodes))[:, None], column.shape)
-        values = np.broadcast_to(weight, column.shape)
-        entries = scipy.sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), (len(nodes), count))
-        return NodeValueSmoother(nodes, entries.tocsr())
+        return NodeValueSmoother(nodes, _smoothing_matrix(self, tuple(nodes.tolist()), count, step))
 
     def _response(self, step: float) -> Array:
         """Response to an impulse in the middle of an odd number of samples."""
@@ -126,6 +120,18 @@ def _weights(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
     reach = int(np.abs(np.flatnonzero(np.abs(response) > _MIN_RELATIVE_WEIGHT * response[middle]) - middle).max())
     weight = response[middle - reach : middle + reach + 1]
     return np.asarray(weight / weight.sum())
+
+
+@lru_cache(maxsize=8)
+def _smoothing_matrix(
+    low_pass: ZeroPhaseLowPassFilter, nodes: tuple[int, ...], count: int, step: float
+) -> scipy.sparse.csr_array:
+    weight = _weights(low_pass, step)
+    reach = len(weight) // 2
+    column = np.clip(np.array(nodes, int)[:, None] + np.arange(-reach, reach + 1), 1, count - 1)
+    row = np.broadcast_to(np.arange(len(nodes))[:, None], column.shape)
+    values = np.broadcast_to(weight, column.shape)
+    return scipy.sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), (len(nodes), count)).tocsr()
 
 
 def zero_phase_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
