@@ -247,7 +247,7 @@ def select_effects(
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
-        # one effect more than allowed only tells how wrong the others may be
+        # more effects than allowed only tell how wrong the others may be; as many are tried
         is_full = len(base) >= limits.max_effects
         if _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
@@ -257,7 +257,7 @@ def select_effects(
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
         if promised < limits.min_explained_fraction * max(2 * nominal.cost - nominal.residual_count, 1.0):
             break
-        shortlist = _refit_shortlist(seen, limits)
+        shortlist = _refit_shortlist(seen, limits)[: len(base) if is_full else None]
         fits = refit_with_each_effect(search, base, shortlist, better.values)
         if len(base) == 1 and not is_full:
             pairs = _pairs_to_refit(search, screened, base[0])
