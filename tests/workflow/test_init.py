@@ -409,8 +409,12 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.Ca
     columns = {"r": "position:roll", "p": "position:pitch", "ax": "x:tip", "ay": "y:tip", "az": "z:tip"}
     assert run.import_.column_meanings == columns
     assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
+    left = "/scan was left out (9 of Scan): its type is not known"
+    write_recording(replace(read_recording("again.h5"), notes=(left,)), "again.h5")
     assert main(["init", "wrist.urdf", "again.h5", "--out", "my run.yaml", *CABLE]) == 0
-    assert "yid-ocp check 'my run.yaml'" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"note: {left}" in said
+    assert "yid-ocp check 'my run.yaml'" in said
     assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
 
 
