@@ -46,6 +46,8 @@ from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects import EFFECTS, EffectBase
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
@@ -238,6 +240,14 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
 
 def test_a_diagnosis_says_what_is_written_down():
     assert said() == json.loads(FILE.read_text("utf-8"))
+
+
+def test_friction_is_to_be_fitted_law_by_law(monkeypatch):
+    kinds = {kind for own in EFFECT_KINDS_BY_FRICTION_LAW.values() for kind in own}
+    assert all(EFFECTS[kind].is_joint_friction for kind in kinds)
+    assert "yid-ocp friction" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+    monkeypatch.setattr(EffectBase, "is_joint_friction", True)
+    assert "`yid-ocp friction CONFIG` fits the friction" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():
