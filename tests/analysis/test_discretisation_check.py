@@ -55,7 +55,7 @@ def test_too_few_links_are_told_and_counted(coarse):
     assert -error < moved < -0.4 * error
     said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
     assert "With twice the links, these estimates would change by more than their" in said
-    assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sdouble", said)
+    assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sset", said)
 
 
 def test_python_and_shell_say_the_same(coarse):
@@ -133,7 +133,7 @@ def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, la
     found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency", "point_mass", "length_scale"))
     assert [effect.label for effect in found.accepted_effects] == causes
     assert (found.is_corrected_for_links, found.remaining_test.chi2_per_dof < 1.5) == (True, True)
-    assert "The diagnosis subtracted the error from too few links" in found.summary
+    assert "set model.object.named_segments.north.links: 12" in found.summary
     true, fit = {"bend": 1.5 * TRUTH["north.bend"], "delay": late, "mass": 0.03}, found.final_model
     known = [(fit.values[name], fit.std[name], true[name.rpartition(".")[2]]) for name in fit.values]
     assert all(abs(value - own) < 2 * std < 0.04 * own for value, std, own in known)

@@ -53,6 +53,7 @@ FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 SPEED, ACCELERATION, GRAVITY = "the speed", "the acceleration", "the orientation to gravity"
 REASONS = ("little", "stand_in")
+STEPS = {"stated_and_used_time_step": (0.01, 0.01)}
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 
@@ -164,10 +165,15 @@ def unknown():
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
-        yield f"followed for {kept} s", finding(truncated_recordings=(HeldOutTruncation("other", kept, 5.0),))
+        yield (
+            f"followed for {kept} s",
+            finding(
+                truncated_recordings=(HeldOutTruncation("other", kept, 5.0),), stated_and_used_time_step=(0.01,) * 2
+            ),
+        )
     yield "a finer step", finding("no_gap", stated_and_used_time_step=(0.01, 0.005))
     lost = (HeldOutTruncation("other", 0.0, 5.0),)
-    yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
+    yield ("none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True, **STEPS))
 
 
 def compared():

@@ -161,11 +161,12 @@ def test_an_interval_is_shown_of_every_number_that_is_known():
 def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
-    lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
+    finer = {"links": "model.object.links: 8"}
+    lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"], finer_settings=finer))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
     rest = "With half the time step, no estimate would change by more than its ± from the recordings (good)."
     assert lines.index("it snaps") < (at := lines.index(said))
-    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
+    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set model.object.links: 8.", rest]
     lines = told("yid-solve/1", solved(discretisation={name: own | {"links": None} for name, own in moved.items()}))
     assert not any("twice the links" in line for line in lines)
 

@@ -313,7 +313,7 @@ def _followed(
         composed = replace(search.problem, problem=nominal.problem)
         composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, fraction)
         for cut in cuts:
-            search.progress.begin_stage(held_out_truncation_message(cut))
+            search.progress.begin_stage(held_out_truncation_message(cut, nominal.problem.step.time_step))
             found[cut.recording] = cut
         search = replace(search, problem=composed)
         name = f"the nominal model, limited to the part that it can follow ({fraction:g})"

@@ -67,14 +67,16 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
     text += [] if result.law is None else [result.law.sentence]
-    text += [*map(held_out_truncation_message, result.truncated_recordings), *_bound_by_priors(result)]
-    text += _earlier_runs(result)
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    links = "The diagnosis subtracted the error from too few links. For other commands, double `links` in model.object."
+    step = result.stated_and_used_time_step[1]
+    text += [held_out_truncation_message(cut, step) for cut in result.truncated_recordings]
+    text += [*_bound_by_priors(result), *_earlier_runs(result)]
+    finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
+    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
+    links = "The diagnosis subtracted the error from too few links. For other commands, set "
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
-    text += [f"{step} (set problem.time_step: {used} for other commands)." * (stated != used)]
-    text += [links * result.is_corrected_for_links, blocks * result.is_split_in_blocks]
+    text += [f"{finer} (set problem.time_step: {used} for other commands)." * (stated != used)]
+    text += [links + f"{divided.setting_text}." if divided else "", blocks * result.is_split_in_blocks]
     kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
     where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
     told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
@@ -84,10 +86,10 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     return "\n".join(filter(None, text))
 
 
-def held_out_truncation_message(cut: HeldOutTruncation) -> str:
+def held_out_truncation_message(cut: HeldOutTruncation, time_step: float) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
     used = f"Only {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}' are used"
-    return f"{used}, because its simulation then fails. To use more, halve problem.time_step."
+    return f"{used}, because its simulation then fails. To use more, set problem.time_step: {time_step / 2:.4g}."
 
 
 def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:

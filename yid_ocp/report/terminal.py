@@ -176,16 +176,16 @@ def misfit_summary_blocks(
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    noise = ("encoder_noise", "more encoder noise", "lower problem.path_cutoff")
-    step = ("time_step", "half the time step", "shorten problem.time_step")
-    for key, words, remedy in (("links", "twice the links", "set more links in model.object"), step, noise):
+    kinds = {"links": "twice the links", "time_step": "half the time step", "encoder_noise": "more encoder noise"}
+    for key, words in kinds.items():
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. To cure this, {remedy}.")
+            remedy = f" To cure this, set {setting}." if (setting := result.get("finer_settings", {}).get(key)) else ""
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{remedy}")
         elif tried:
             said.append(f"With {words}, no estimate would change by more than its ± from the recordings (good).")
     return said

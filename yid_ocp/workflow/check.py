@@ -72,6 +72,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
+            "finer_settings": {} if problem is None else discretisation.finer_setting_texts(problem),
             "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
             "warnings": warnings,
         }
@@ -184,7 +185,8 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
         said = "the model cannot be simulated with the initial parameters, so `solve` may fail. Set larger stiffnesses "
-        warnings.append(f"{said}(parameters.NAME.initial) or a smaller problem.time_step. The reason: {at_x.message}")
+        said += f"(parameters.NAME.initial) or problem.time_step: {problem.step.time_step / 2:g}"
+        warnings.append(f"{said}. The reason: {at_x.message}")
         return {}
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
@@ -218,20 +220,21 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
         grow = f"at the first posture, {count_with_noun(own.n_unstable_modes, 'vibration')} of the model would grow in "
-        grow += "every step, so the simulation is unstable. Set a shorter problem.time_step, "
+        grow += f"every step, so the simulation is unstable. Set problem.time_step: {h / 2:g}, "
         warnings.append(f"{grow}{remedy}or a larger model.damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
-    _warn(warnings, "the time step goes", " s", steps)
+    _warn(warnings, f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
     rows: list[dict[str, Any]] = []
-    count = None if run.model.object is None else run.model.object.uniform_or_total_link_count
-    if count is not None:
+    count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
+    if item is not None and count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)
         values = {own: x * link_division_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
-        _warn(warnings, "the number of links goes", "", rows)
+        links = f"the number of links goes from {count} to {2 * count}"
+        _warn(warnings, links, item.divided_links_setting_text, rows)
     return {"links": rows, "time_step": steps, "message": ""}
 
 
@@ -240,12 +243,11 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 
 
-def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
+def _warn(warnings: list[str], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row."""
-    coarse, fine, remedy = rows[0], rows[-1], "set a shorter problem.time_step" if unit else "use more links"
-    for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
+    for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}. If this vibration matters, {remedy}"
             limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
             moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
-            warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")
+            change = f"natural frequency {i + 1} changes from {moved} when {when}"
+            warnings.append(f"{change}. If this vibration matters, set {remedy}")
