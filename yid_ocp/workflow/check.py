@@ -57,11 +57,13 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         progress.begin_stage("comparing masses and inertias with the library Pinocchio")
         mechanics = _mechanics(run, step, problem, warnings)
         progress.begin_stage("testing whether links and time step are fine enough")
-        convergence = _frequency_convergence(run, problem, warnings)
-        moved, shown = {}, {}
+        coarse: list[str] = []
+        convergence = _frequency_convergence(run, problem, warnings, coarse)
+        moved, shown, misfit = {}, {}, None
         if problem is not None:
             first = problem.evaluate(problem.initial_unknowns)
-            moved = _moves(problem, first, warnings, progress)
+            moved = _moves(problem, first, warnings, coarse, progress)
+            misfit = float(np.sqrt(np.mean(first.residual[problem.residual_rows.data] ** 2))) if first.ok else None
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
@@ -74,10 +76,12 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "discretisation": moved,
             "finer_settings": {} if problem is None else discretisation.finer_setting_texts(problem),
             "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
+            "initial_misfit": misfit,
+            "discretisation_warnings": coarse,
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings))
+    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings + coarse))
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -178,7 +182,9 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
     return scenes
 
 
-def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress) -> dict[str, Any]:
+def _moves(
+    problem: EstimationProblem, at_x: Evaluation, warnings: list[str], coarse: list[str], progress: Progress
+) -> dict[str, Any]:
     x = problem.initial_unknowns
     growth = discretisation.alternating_error_growth_of_worst_recording(problem, x)
     if growth is not None and not growth.keeps_errors_below_resolution:
@@ -191,14 +197,16 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
-    warnings += notes
+    coarse += notes
     # the misfit of initial values does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
     return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
 
 
-def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
+def _frequency_convergence(
+    run: RunSettings, problem: EstimationProblem | None, warnings: list[str], coarse: list[str]
+) -> dict[str, Any]:
     """Lowest natural frequencies with twice the links (`links`), and with half and a quarter of the `time_step`."""
     system = build_system(run)
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
@@ -224,7 +232,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         warnings.append(f"{grow}{remedy}or a larger model.damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
-    _warn(warnings, f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
+    _warn(coarse, f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
     rows: list[dict[str, Any]] = []
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
@@ -234,7 +242,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
-        _warn(warnings, links, item.divided_links_setting_text, rows)
+        _warn(coarse, links, item.divided_links_setting_text, rows)
     return {"links": rows, "time_step": steps, "message": ""}
 
 
