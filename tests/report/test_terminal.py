@@ -247,6 +247,10 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     lines = told("yid-diagnosis/2", result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
     assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
+    unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
+    lines = told("yid-diagnosis/2", result | {"unseen": unseen})
+    at = next(i for i, line in enumerate(lines) if "would not show" in line)
+    assert "slip@grasp, friction (7 places), mass (7 places), " in " ".join(lines[at : at + 2])
     refitted = told("yid-diagnosis/2", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")

@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text, p_value_text
+from yid_ocp.display import abbreviated_names_text, p_value_text, unseen_effects_sentence
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
@@ -140,8 +140,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    blind = _listed("These motions would not show these effects, even if they exist: ", unseen, max_entries=len(unseen))
-    return [small * is_significant, narrow * (along < level), blind]
+    return [small * is_significant, narrow * (along < level), unseen_effects_sentence(unseen)]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
