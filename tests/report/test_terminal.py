@@ -164,10 +164,12 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     finer = {"links": "model.object.links: 8"}
     lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"], finer_settings=finer))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    rest = "With half the time step, no estimate would change by more than its ± from the recordings (good)."
+    rest = "With half the time step, no estimate would change by more than its ± from the recordings."
     assert lines.index("it snaps") < (at := lines.index(said))
     assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set model.object.links: 8.", rest]
-    lines = told("yid-solve/1", solved(discretisation={name: own | {"links": None} for name, own in moved.items()}))
+    own = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
+    lines = told("yid-solve/1", solved(discretisation=own))
+    assert "This assumes that the noise is as stated (sensors.joints.position.std)," in " ".join(lines)
     assert not any("twice the links" in line for line in lines)
 
 

@@ -176,7 +176,9 @@ def misfit_summary_blocks(
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    kinds = {"links": "twice the links", "time_step": "half the time step", "encoder_noise": "more encoder noise"}
+    kinds = {"links": "twice the links", "time_step": "half the time step"}
+    kinds["encoder_noise"] = "the stated encoder noise once more"
+    limits = " This assumes that the noise is as stated (sensors.joints.position.std), and tests for no other error."
     for key, words in kinds.items():
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
@@ -187,7 +189,8 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
             remedy = f" To cure this, set {setting}." if (setting := result.get("finer_settings", {}).get(key)) else ""
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{remedy}")
         elif tried:
-            said.append(f"With {words}, no estimate would change by more than its ± from the recordings (good).")
+            said.append(f"With {words}, no estimate would change by more than its ± from the recordings.")
+            said[-1] += limits if key == "encoder_noise" else ""
     return said
 
 

@@ -140,7 +140,7 @@ class _RemainingTime:
         After a plan has grown, it is the elapsed time: a search that repeats its stages can grow many times.
         """
         if self._has_grown:
-            return f", {_format_duration(time.monotonic() - self._start_of_command)} so far"
+            return f", {time.monotonic() - self._start_of_command:.0f} s so far"
         return "" if math.isnan(seconds := self.seconds_left()) else f", about {_format_duration(seconds)} left"
 
     def seconds_left(self) -> float:
