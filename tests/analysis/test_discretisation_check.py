@@ -99,7 +99,7 @@ def test_check_says_it_before_anything_is_solved(folder, carried_out):
     # a far start is said in one sentence, and the rest of it is in the file
     assert ["With twice the links" in done.out for done in (far, *near)] == [False, True, True]
     assert ("the model error is" in far.out, "warning: natural frequency" in far.out) == (True, False)
-    assert far.result["discretisation_warnings"]
+    assert far.result["convergence"]["warnings"]
 
 
 @pytest.mark.slow

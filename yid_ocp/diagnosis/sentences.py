@@ -188,11 +188,9 @@ def _causes(result: DiagnosisResult) -> list[str]:
         "stand_in": f"{none} {size}{apart}. {either}.",
     }
     laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
-    fitted_alone = (
-        f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
-    )
-    fitted_alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    return [*text, reasons[result.unknown_reason], fitted_alone * bool(laws), _several_places(result)]
+    alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
+    alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
+    return [*text, reasons[result.unknown_reason], alone * bool(laws), _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:

@@ -388,11 +388,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         far += "Tests of links and time step say little there: they are in result.json, and `solve` repeats them."
         yield SummaryStatement(far, "verdict")
     else:
-        yield (
-            "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)" if moved else ""
-        )
-        yield from moved
-        warnings = [*warnings, *result["discretisation_warnings"]]
+        fine = "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)"
+        yield from [fine, *moved] if moved else []
+        warnings = [*warnings, *convergence["warnings"]]
     yield from issue_summary_blocks(result)
     yield from (SummaryStatement(f"warning: {text}", "verdict") for text in warnings)
     ended = "No problem was found, so a run is possible."

@@ -57,8 +57,8 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         progress.begin_stage("comparing masses and inertias with the library Pinocchio")
         mechanics = _mechanics(run, step, problem, warnings)
         progress.begin_stage("testing whether links and time step are fine enough")
-        coarse: list[str] = []
-        convergence = _frequency_convergence(run, problem, warnings, coarse)
+        convergence = _frequency_convergence(run, problem, warnings)
+        coarse = convergence["warnings"]
         moved, shown, misfit = {}, {}, None
         if problem is not None:
             first = problem.evaluate(problem.initial_unknowns)
@@ -77,7 +77,6 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "finer_settings": {} if problem is None else discretisation.finer_setting_texts(problem),
             "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
             "initial_misfit": misfit,
-            "discretisation_warnings": coarse,
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
@@ -204,16 +203,15 @@ def _moves(
     return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
 
 
-def _frequency_convergence(
-    run: RunSettings, problem: EstimationProblem | None, warnings: list[str], coarse: list[str]
-) -> dict[str, Any]:
+def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
     """Lowest natural frequencies with twice the links (`links`), and with half and a quarter of the `time_step`."""
+    found: dict[str, Any] = {"links": [], "time_step": [], "message": "", "warnings": []}
     system = build_system(run)
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
         message = "not computed, because a posture is needed, which comes from a recording"
-        return {"links": [], "time_step": [], "message": message}
+        return found | {"message": message}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:
@@ -224,26 +222,25 @@ def _frequency_convergence(
     frequencies = step_diagnostics.step_map_natural_frequencies
     own = frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
-        return {"links": [], "time_step": [], "message": own.message}
+        return found | {"message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
         grow = f"at the first posture, {count_with_noun(own.n_unstable_modes, 'vibration')} of the model would grow in "
         grow += f"every step, so the simulation is unstable. Set problem.time_step: {h / 2:g}, "
         warnings.append(f"{grow}{remedy}or a larger model.damping")
-    steps = [_row(h, own)]
+    found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
-    _warn(coarse, f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
-    rows: list[dict[str, Any]] = []
+    _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)
         values = {own: x * link_division_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
-        rows = [_row(count, own), _row(2 * count, finer)]
+        found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
-        _warn(coarse, links, item.divided_links_setting_text, rows)
-    return {"links": rows, "time_step": steps, "message": ""}
+        _warn(found["warnings"], links, item.divided_links_setting_text, rows)
+    return found
 
 
 def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:

@@ -38,12 +38,11 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
             for law in EFFECT_KINDS_BY_FRICTION_LAW
         }
-        problems: list[EstimationProblem] = []
-        for settings in by_law.values():
-            problem = friction_law_comparison.problem_estimating_from_all_recordings(build_problem(settings))
-            if not problems:  # before the other models are compiled
-                kinds = _testable_motion_kinds(settings, problem)
-            problems.append(problem)
+        settings, *others = by_law.values()
+        on_all = friction_law_comparison.problem_estimating_from_all_recordings
+        problem = on_all(build_problem(settings))
+        kinds = _testable_motion_kinds(settings, problem)  # before the other models are compiled
+        problems = [problem, *(on_all(build_problem(own)) for own in others)]
         problems = friction_law_comparison.problems_with_common_samples(problems)
         progress.begin_stage("fitting the friction laws, each also with one kind of motion left out in turn")
         parts = PartsDoneCounter(progress, len(problems) * (1 + len(kinds)), next(iter(by_law)))
@@ -98,9 +97,8 @@ def _testable_motion_kinds(run: RunSettings, problem: EstimationProblem) -> dict
     if {*rubbing} <= {*problem.system.prescribed} and not any(own.sensor.effort_joints for own in compared):
         what = "the joints follow their measured angles, so friction shows only in torques, which are not used"
         where, hint = run.setting_location("sensors"), f"set sensors.{JOINT_EFFORT_SENSOR_KEY}.use: true"
-        arms = [episode.recording.joints for episode in problem.episodes]
-        stated = run.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions()).bias_std
-        if stated is None and any(arm is not None and arm.effort_bias_std is None for arm in arms):
+        arm, said = problem.episodes[0].recording.joints, run.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
+        if said.bias_std is None and arm is not None and arm.effort_bias_std is None:
             hint += " and, unless the torques have no constant error, bias_std there to its expected size [N m]"
         raise DataError(what, where=where, allowed="recorded torques that the fit compares with the model", hint=hint)
     return kinds

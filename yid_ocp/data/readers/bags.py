@@ -282,7 +282,7 @@ def _contents(
                 continue
             for source, part, kind in _parts_of_message(connection.topic, content, connection.msgtype):
                 if connection.msgtype not in _TREES or trees is None or source in trees:
-                    lists.get(kind, places).append(_message(source, logged, part, kind))
+                    lists.get(kind, places).append(BagMessage(source, int(logged), _stamp(part), _plain(part, kind)))
     return _Contents(bag, states, places, mounted, own_topic)
 
 
@@ -322,10 +322,6 @@ def _default_joint_topics(bag: OpenBag) -> list[str]:
 def _stamp(content: Any) -> int:
     header = getattr(content, "header", None)
     return 0 if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-
-
-def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
-    return BagMessage(source, int(logged), _stamp(content), _plain(content, kind))
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
