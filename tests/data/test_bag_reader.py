@@ -112,8 +112,7 @@ def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (points.name, points.names) == ("points", ("w_T1", "w_T2"))
     assert (points.frame, points.sensor_name, points.clock) == ("camera_link", "camera", "recorded")
     assert np.allclose(points.t, [0.005, 0.025])
-    expected = [[[0.0, 0, 1], [0.1, 0, 1]], [[0.2, 0, 1], [np.nan] * 3]]
-    assert np.allclose(points.position, expected, equal_nan=True)
+    assert np.allclose(points.position, [[[0.0, 0, 1], [0.1, 0, 1]], [[0.2, 0, 1], [np.nan] * 3]], equal_nan=True)
     assert recording.name == "run"
     assert recording.sha256 is not None
     write_recording(recording, tmp_path / "run.h5")

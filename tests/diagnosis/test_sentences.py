@@ -123,17 +123,15 @@ def effects():
         rest = {"remaining_test": outcome(p=p, chi2=chi2), "remaining_gap_locations": where}
         yield f"remains chi2 {chi2}, p = {p}, {len(where)} places", with_effect(FRICTION, 0.5, **rest)
     for before, after in [(10.0, 11.1), (10.0, 8.9), (10.0, 11.0), (-10.0, -8.9), (0.0, 1e-9), (0.0, 1e-11)]:
-        moved = absorbing(FRICTION, **{"T1.bend": (before, after)})
-        yield f"moves from {before} to {after}", finding(**moved)
+        yield f"moves from {before} to {after}", finding(**absorbing(FRICTION, **{"T1.bend": (before, after)}))
     yield "eight parameters move", finding(**absorbing(FRICTION, **{f"p{i}": (1.0, 2.0) for i in range(8)}))
     yield "in blocks", with_effect(FRICTION, 0.5, is_split_in_blocks=True)
 
 
 def unknown():
     """Why a gap has no name, with the numbers that decide it."""
-    both = fit(
-        [FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25}, std={"offset@wrist.a": 0.2}
-    )
+    sizes = {"friction@elbow.a": 0.5, "offset@wrist.a": 0.25}
+    both = fit([FRICTION, OFFSET], values=sizes, std={"offset@wrist.a": 0.2})
     unsure = (added(FRICTION, fitted=fit([FRICTION], values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": 0.3})),)
     for name, reason, changed in [
         ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
@@ -165,15 +163,11 @@ def unknown():
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
-        yield (
-            f"followed for {kept} s",
-            finding(
-                truncated_recordings=(HeldOutTruncation("other", kept, 5.0),), stated_and_used_time_step=(0.01,) * 2
-            ),
-        )
+        cut = (HeldOutTruncation("other", kept, 5.0),)
+        yield f"followed for {kept} s", finding(truncated_recordings=cut, **STEPS)
     yield "a finer step", finding("no_gap", stated_and_used_time_step=(0.01, 0.005))
     lost = (HeldOutTruncation("other", 0.0, 5.0),)
-    yield ("none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True, **STEPS))
+    yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True, **STEPS)
 
 
 def compared():

@@ -220,8 +220,7 @@ def test_a_simulation_that_failed_and_one_that_did_not():
 def test_blocks_on_a_terminal():
     table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
     assert terminal.summary_terminal_lines([]) == []
-    hidden = replace(table, is_page_only=True)
-    blocks = [table, SummaryStatement("said"), table, hidden, CodeBlock("do it\nnow")]
+    blocks = [table, SummaryStatement("said"), table, replace(table, is_page_only=True), CodeBlock("do it\nnow")]
     assert terminal.summary_terminal_lines(blocks) == [
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip

@@ -262,9 +262,8 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
         return -math.inf
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
     rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
-    before, after = (
-        [_excess_of(r[at]) for at in part] for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
-    )
+    pairs = zip((fit.evaluation.residual, left), rows, strict=True)
+    before, after = ([_excess_of(r[at]) for at in part] for r, part in pairs)
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 

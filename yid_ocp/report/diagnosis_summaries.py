@@ -222,8 +222,7 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    runs = result["runs"]
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    runs, found = result["runs"], dict[str, list[Mapping[str, Any]]]()
     for entry in runs:
         for name, own in entry["parameters"].items():
             if own["value"] is not None:

@@ -115,9 +115,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         if not entries:
             continue
-        error, noise = (
-            _rms([e[key][c] for e in entries for c in channels if c in e.get(key, {})]) for key in ("rmse", "expected")
-        )
+        told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
+        error, noise = map(_rms, told)
         known = [e["baselines"] for e in entries]
         names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
         guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}

@@ -124,10 +124,8 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
     """Return what recorded torques that a result does not use could tell. Empty if there are none."""
-    said = (
-        "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
-    )
-    return said if result.get("unused_efforts") else ""
+    use = "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
+    return use if result.get("unused_efforts") else ""
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -156,9 +154,8 @@ def misfit_summary_blocks(
                 relative = entry.get("std_relative")
                 std = entry["std"] if "std" in entry else relative and relative * abs(entry["value"])
                 if std is not None and std <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
-                    known.append(
-                        f"{name} = {uncertainty.value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}"
-                    )
+                    value = uncertainty.value_and_uncertainty_text(entry["value"], std, None)
+                    known.append(f"{name} = {value} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
             none = "Do not use the values, because none is known to within 10 % if ± includes the model error."

@@ -231,8 +231,7 @@ def _check_recordings(
     run: RunSettings, system: System, free: Sequence[str], estimate: Sequence[Recording], held_out: Sequence[Recording]
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
-    issues: list[Issue] = []
-    cable = cable_vertices_between_clamps(run)
+    issues, cable = list[Issue](), cable_vertices_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, free)
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
@@ -277,8 +276,7 @@ def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
 def _once(
     run: RunSettings, estimate: Sequence[Recording], held_out: Sequence[Recording], issues: list[Issue]
 ) -> tuple[list[Recording], list[Recording]]:
-    used: list[Recording] = []
-    others: list[Recording] = []
+    used, others = list[Recording](), list[Recording]()
     for recording in estimate:
         if same := _duplicate(used, recording):
             issues.append(replace(same[0], what=f"{same[0].what}, so these samples are used only once"))

@@ -132,8 +132,7 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
-    options = import_recording.reader_options_from_arguments(arguments)
-    made: dict[Path, Recording | None] = {}
+    options, made = import_recording.reader_options_from_arguments(arguments), dict[Path, Recording | None]()
     for file in map(Path, arguments.files):
         if not import_recording.has_native_recording_suffix(file):
             recording = import_recording.read_third_party_recording(file, options, progress)

@@ -236,8 +236,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
-    states = _default_joint_topics(bag.file)
-    owners: dict[str, set[str]] = {}
+    states, owners = _default_joint_topics(bag.file), dict[str, set[str]]()
     for message in (message for message in bag.states if message.source in states):
         for joint in message.content.name:
             owners.setdefault(joint, set()).add(message.source)
