@@ -29,8 +29,7 @@ def test_a_line_and_a_table():
     table = "<table><tr><th>name</th><th>value</th></tr><tr><td>x &amp; y</td><td>1</td></tr></table>"
     assert thing._repr_html_() == f"<p><b>Thing</b>: a &lt; b</p>{table}"
     assert "<table>" not in Thing("alone", [("head",)])._repr_html_()
-    rows = [("name", "value"), *((f"r{i}", "") for i in range(35))]
-    text = Thing("long", rows)._repr_html_()
+    text = Thing("long", [("name", "value"), *((f"r{i}", "") for i in range(35))])._repr_html_()
     assert text.count("<tr>") == 32
     assert "<td>and 5 more</td><td></td>" in text
 

@@ -86,6 +86,21 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
     return ", ".join(said) + (f" and {left} more" if left else "")
 
 
+def locations_by_effect_kind(labels: Sequence[str]) -> dict[str, list[str]]:
+    """Group labels `kind@location` of effects by their kind."""
+    found: dict[str, list[str]] = {}
+    for kind, _, location in (label.partition("@") for label in labels):
+        found.setdefault(kind, []).append(location)
+    return found
+
+
+def unseen_effects_sentence(labels: Sequence[str]) -> str:
+    """Sentence on effects that recordings would not show. Empty if there are none."""
+    known = locations_by_effect_kind(labels).items()
+    kinds = [f"{kind} ({len(own)} places)" if len(own) > 1 else f"{kind}@{own[0]}" for kind, own in known]
+    return f"These recordings would not show these effects, even if they exist: {', '.join(kinds)}." if kinds else ""
+
+
 class Progress:
     """A base class for receivers of progress reports, which ignores all reports. One thread at a time calls it."""
 

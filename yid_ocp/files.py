@@ -237,9 +237,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 def _value(hint: Any, value: Any) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        return _value(next(entry for entry in arguments if entry is not type(None)), value)
+        return None if value is None else _value(next(own for own in arguments if own is not type(None)), value)
     if origin is np.ndarray:
         return np.array(value["values"], dtype=typing.get_args(arguments[1])[0]).reshape(value["shape"])
     if origin is tuple:

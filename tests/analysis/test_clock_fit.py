@@ -67,9 +67,8 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
     )
     assert [doubt.recording for doubt in doubts] == [sure[0].name, sure[2].name]
     assert " ms late and corrects them" in doubts[0].what
-    before, after = (
-        fit_problem(own, GaussNewton()).goodness_of_fit.chi2_per_dof for own in (problem, problems["fitted"])
-    )
+    fits = (fit_problem(own, GaussNewton()) for own in (problem, problems["fitted"]))
+    before, after = (fit.goodness_of_fit.chi2_per_dof for fit in fits)
     assert before > 1.5
     assert after == pytest.approx(1.0, abs=0.15)
     found = {std: fit_problem(problem, GaussNewton()).parameters for std, problem in problems.items()}

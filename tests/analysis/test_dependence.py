@@ -57,8 +57,7 @@ def hanging():
 
     def build(gravity=(0.0, 0.0, -9.81), turned=(math.pi, 0.0, 0.0)):
         place = homogeneous_transform(rotation_from_rpy(*turned), np.zeros(3))
-        system = System.build(objects=[(rod, None, place)], gravity=gravity)
-        step = compile_step(system, 0.01, use_compiler=False)
+        step = compile_step(System.build(objects=[(rod, None, place)], gravity=gravity), 0.01, use_compiler=False)
         recording = Recording(None, (camera(t, ["w_T1"]),), name="hanging")
         return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), ProblemOptions())
 

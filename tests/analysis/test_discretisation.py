@@ -116,8 +116,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     fine.evaluate = lambda x, derivatives, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
     guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
-    divided = _fine_joints_by_coarse_joint(coarse.system, fine.system)
-    refined = _FinerModel(fine, {"a": 2.0, "c": 3.0}, divided)
+    refined = _FinerModel(fine, {"a": 2.0, "c": 3.0}, _fine_joints_by_coarse_joint(coarse.system, fine.system))
     _gauss_newton_step_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
@@ -227,8 +226,7 @@ def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_
     fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
     np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
     found, finer = (fit_problem(problem, GaussNewton()) for problem in (coarse, anew))
-    refined = _FinerModel(fine)
-    own, left, _ = _gauss_newton_step_in_finer_model(refined, found.problem, found.x, found.evaluation)
+    own, left, _ = _gauss_newton_step_in_finer_model(_FinerModel(fine), found.problem, found.x, found.evaluation)
     std = np.array([found.std[name] for name in free])
     change = (finer.x - found.x) / std
     assert np.abs(change).max() > 2

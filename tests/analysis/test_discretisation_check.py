@@ -55,7 +55,7 @@ def test_too_few_links_are_told_and_counted(coarse):
     assert -error < moved < -0.4 * error
     said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
     assert "With twice the links, these estimates would change by more than their" in said
-    assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sdouble", said)
+    assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sset", said)
 
 
 def test_python_and_shell_say_the_same(coarse):
@@ -88,15 +88,18 @@ def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
 
 def test_check_says_it_before_anything_is_solved(folder, carried_out):
     """At the truth the move is nearly the one at the estimate, whatever the data; a poor fit makes nothing unsure."""
-    poor, moved = (
-        carried_out("check", configuration(folder, 4, ["north"], start), out=f"{start}").result["discretisation"]
-        for start in (2.0, 1.0)
+    far, *near = (
+        carried_out("check", configuration(folder, 4, ["north"], start), out=f"{start}") for start in (0.01, 2.0, 1.0)
     )
-    poor, moved = poor["north.bend"], moved["north.bend"]
+    poor, moved = (done.result["discretisation"]["north.bend"] for done in near)
     assert 1 < poor["std"] / moved["std"] < 10
     assert -0.3 < moved["links"] / TRUTH["north.bend"] < -0.08
     assert abs(moved["time_step"]) < 0.02 * TRUTH["north.bend"]
     assert moved["std"] < 0.02 * TRUTH["north.bend"]
+    # a far start is said in one sentence, and the rest of it is in the file
+    assert ["With twice the links" in done.out for done in (far, *near)] == [False, True, True]
+    assert ("the model error is" in far.out, "warning: natural frequency" in far.out) == (True, False)
+    assert far.result["convergence"]["warnings"]
 
 
 @pytest.mark.slow
@@ -133,7 +136,7 @@ def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, la
     found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency", "point_mass", "length_scale"))
     assert [effect.label for effect in found.accepted_effects] == causes
     assert (found.is_corrected_for_links, found.remaining_test.chi2_per_dof < 1.5) == (True, True)
-    assert "The diagnosis subtracted the error from too few links" in found.summary
+    assert "set model.object.named_segments.north.links: 12" in found.summary
     true, fit = {"bend": 1.5 * TRUTH["north.bend"], "delay": late, "mass": 0.03}, found.final_model
     known = [(fit.values[name], fit.std[name], true[name.rpartition(".")[2]]) for name in fit.values]
     assert all(abs(value - own) < 2 * std < 0.04 * own for value, std, own in known)

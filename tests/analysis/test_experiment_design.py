@@ -347,8 +347,7 @@ def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, nam
     assert list(asked.start.values()) == pytest.approx(episode.measured_driven_angles[0])
     still = np.zeros(driven.system.n_coordinates - 2)
     way = np.array([places(driven.system, ["tip"], [*at, *still])[0] for at in episode.measured_driven_angles])
-    farthest = np.linalg.norm(way - way[0], axis=1).max()
-    assert asked.excitation.gripper_travel == pytest.approx(factor * farthest)
+    assert asked.excitation.gripper_travel == pytest.approx(factor * np.linalg.norm(way - way[0], axis=1).max())
     assert (asked.seed, asked.excitation.max_joint_speed) == (11, 1.4 * factor)
     assert asked.excitation.duration == pytest.approx(1.0)
 

@@ -394,8 +394,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
         assert (doubt.group, doubt.severity) == ("points_arm", "not_trusted")
         assert doubt.setting == "sensors.points_arm.use: false"
         # over the limit of half a period of both, at the end of the recording for a drift
-        whole = 5.0 * drift if drift else late
-        assert doubt.limit_violation_ratio == pytest.approx(abs(whole) / 0.01, rel=0.03)
+        assert doubt.limit_violation_ratio == pytest.approx(abs(5.0 * drift if drift else late) / 0.01, rel=0.03)
         if drift:
             begin, end = map(float, re.findall(r"([-+][.\d]+) ms", doubt.what))
             assert (end - begin, end + begin) == pytest.approx((5e3 * drift, 2e3 * late), abs=2.0)
@@ -550,8 +549,7 @@ def hanging(seed: int = 0) -> Recording:
     t = np.arange(200) / 100
     at = np.linspace(-0.8, 0.8, 9)
     arc = 0.5 * np.stack([np.sin(at), 0 * at, 1 - np.cos(at)], axis=1)
-    child = arc[4] + np.array([[0.0, 0.0, -0.07 * i] for i in (1, 2, 3)])
-    shape = np.concatenate([arc, child])
+    shape = np.concatenate([arc, arc[4] + np.array([[0.0, 0.0, -0.07 * i] for i in (1, 2, 3)])])
     swing = 0.02 * np.sin(3 * t)[:, None, None] * np.ones((1, 12, 3))
     noise = 2e-4 * np.random.default_rng(seed).standard_normal((200, 12, 3))
     names = (*(f"p{i}" for i in range(9)), "a1", "a2", "a3")

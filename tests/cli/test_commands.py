@@ -24,7 +24,7 @@ from yid_ocp.data import read_recording
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
-        "covariance", "discretisation_notes", "stability",
+        "covariance", "discretisation_notes", "finer_settings", "stability",
     "issues", "torque_offsets", "to_use", "unused_efforts",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
@@ -216,7 +216,7 @@ def test_check(carried_out, pendulum):
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
     assert {"time_step", "links", "encoder_noise", "std"} == set(result["discretisation"]["shoulder.stiffness"])
-    assert "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)" in done.out
+    assert f"the model error is {result['initial_misfit']:.0f}" in done.out
     assert "100 Hz" in done.out
     assert "run folder: run" in done.out
     assert not any("effort_kind" in text for text in result["warnings"])

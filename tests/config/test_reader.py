@@ -275,8 +275,7 @@ def test_a_number_outside_its_bounds_is_refused(written, key, data, option):
         load_config(written(stream.getvalue()))
     assert caught.value.allowed == options.describe_type(option)
     assert "line" in caught.value.where
-    last = [part for part in key.split(".") if part != "NAME"][-1]
-    assert last in caught.value.where
+    assert [part for part in key.split(".") if part != "NAME"][-1] in caught.value.where
 
 
 ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(

@@ -60,6 +60,15 @@ def frame(stamp: int, child: str, xyz: Sequence[float]) -> Message:
     return "tf2_msgs/msg/TFMessage", fields
 
 
+def poses(stamp: int, *points: Sequence[float]) -> Message:
+    def fields(bag: Bag) -> dict[str, Any]:
+        turn = geometry(bag, "Quaternion", QUARTER)
+        made = [bag.of("geometry_msgs/msg/Pose", geometry(bag, "Point", xyz), turn) for xyz in points]
+        return {"header": bag.header(stamp, "map"), "poses": made}
+
+    return "geometry_msgs/msg/PoseArray", fields
+
+
 def plain(data: Any = "x", kind: str = STRING) -> Message:
     return kind, lambda bag: {"data": data}
 
@@ -103,8 +112,7 @@ def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (points.name, points.names) == ("points", ("w_T1", "w_T2"))
     assert (points.frame, points.sensor_name, points.clock) == ("camera_link", "camera", "recorded")
     assert np.allclose(points.t, [0.005, 0.025])
-    expected = [[[0.0, 0, 1], [0.1, 0, 1]], [[0.2, 0, 1], [np.nan] * 3]]
-    assert np.allclose(points.position, expected, equal_nan=True)
+    assert np.allclose(points.position, [[[0.0, 0, 1], [0.1, 0, 1]], [[0.2, 0, 1], [np.nan] * 3]], equal_nan=True)
     assert recording.name == "run"
     assert recording.sha256 is not None
     write_recording(recording, tmp_path / "run.h5")
@@ -206,7 +214,7 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     assert np.allclose(points.position[3], [[1.0, 0.0, 0.3], [0.0, 0.7, 0.3], [0.5, 0.0, 0.3]])
     left = [note for note in recording.notes if "was left out (" in note]
     assert [note.split()[0] for note in left] == ["/gripper/closed", *(f"/log/{name}" for name in "abcdef")]
-    assert left[0].endswith("(10 of std_msgs/msg/Bool)")
+    assert "(10 of std_msgs/msg/Bool): its type is not known. For joint values, add --field position=/gri" in left[0]
     assert any("of /tf:middle, /vrpn/hand/pose, the orientations were not" in note for note in recording.notes)
     write_recording(recording, tmp_path / "all.h5")
     assert read_any(tmp_path / "all.h5").notes == recording.notes
@@ -295,6 +303,22 @@ def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
     # the quarter turn about z takes x to y and y to -x
     assert np.allclose(points.position[0], [[1, 2, 3], [1, 2.1, 3], [0.9, 2, 3], [1, 2, 3.1]])
     refused(path, "pose_axis_point_distance is 0 m", pose_axis_point_distance=0.0)
+
+
+def test_the_poses_of_an_array_are_points_with_numbers(tmp_path: Path) -> None:
+    """A number is no point if a pose is missing at times, unless the user says so."""
+    times = [START + k * SECOND // 100 for k in range(4)]
+    messages = [("/mocap/markers", t, poses(t, (1, 0, k), (2, 0, k))) for k, t in enumerate(times)]
+    messages += [("/some", t, poses(t, *[(0, k, 0)] * (1 + k % 2))) for k, t in enumerate(times)]
+    path = write_bag(tmp_path, "mcap", messages)
+    contents = preview_file(path)
+    assert [source.imported_as for source in contents.sources] == ["point markers_1, markers_2", ""]
+    recording = read_any(path, **contents.reader_options)
+    assert recording.points[0].names == ("markers_1", "markers_2")
+    assert np.allclose(recording.points[0].position[3], [[1, 0, 3], [2, 0, 3]])
+    assert "To use a point of them, add --points /some:NUMBER=POINT" in recording.notes[-1]
+    (points,) = read_any(path, point_names={"/some:2": "tip"}).points
+    assert (points.names, len(points.t)) == (("tip",), 2)
 
 
 def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:

@@ -175,8 +175,7 @@ def test_what_a_sensor_smooths_is_computed_or_weighed_by_settings_is_not_oversta
     recording = made(rate=1000.0)
     slow = np.random.default_rng(5).standard_normal((len(recording.joints.t) + 20, 3))
     slow = np.stack([np.convolve(x, np.full(21, 21**-0.5), "valid") for x in slow.T], axis=1)
-    smooth = 5 * np.sin(recording.joints.t)[:, None] + 0.05 * slow
-    assert causes(changed(recording, effort=smooth)) == set()
+    assert causes(changed(recording, effort=5 * np.sin(recording.joints.t)[:, None] + 0.05 * slow)) == set()
     recording = changed(made(), effort_std=1.0)
     assert causes(recording) == {"noise_overstated"}
     assert causes(recording, joints_effort=SensorOptions(std=1.0)) == set()
@@ -214,8 +213,7 @@ def test_one_measurement_listed_twice_is_told_also_in_part():
 
 def encoder_counts_per_turn(seed: int, n: int = 3000) -> Recording:
     """A slow motion of one joint, read to a 4096th of a turn at uneven times."""
-    rng = np.random.default_rng(seed)
-    t = np.cumsum(0.0053 + 0.0005 * rng.uniform(-1, 1, n))
+    t = np.cumsum(0.0053 + 0.0005 * np.random.default_rng(seed).uniform(-1, 1, n))
     angle, step = np.sin(0.7 * t + seed) + 0.3 * np.sin(1.9 * t), 2 * np.pi / 4096
     return Recording(JointGroup(("a",), t - t[0], step * np.rint(angle / step)[:, None]), name=f"run_{seed}")
 

@@ -146,8 +146,7 @@ def test_small_numbers_are_radians_unless_the_robot_never_records_them(
     ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
 )
 def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_path: Path) -> None:
-    path = write_dataset(tmp_path / "arm", "v3.0", **more)
-    assert "arm" in refused(path, message, **options).where
+    assert "arm" in refused(write_dataset(tmp_path / "arm", "v3.0", **more), message, **options).where
 
 
 @pytest.mark.parametrize(

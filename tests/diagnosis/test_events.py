@@ -252,8 +252,7 @@ def test_up_to_three_samples_among_forty_are_named_as_wrong(count, wrong, named)
 
 def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(bench):
     def push(t):
-        part = np.clip((t - 1.5) / 0.4, 0, 1)
-        return -np.stack([0 * t, 0.5 * np.sin(np.pi * part) ** 2], axis=1)
+        return -np.stack([0 * t, 0.5 * np.sin(np.pi * np.clip((t - 1.5) / 0.4, 0, 1)) ** 2], axis=1)
 
     problem = bench.problem([bench.recording({}, 1, torque=push)])
     finding = diagnose(problem, ["joint_coulomb@elbow", "effort_offset@elbow"], [bench.recording({}, 2)])

@@ -144,8 +144,7 @@ def test_a_linear_law_of_a_segment_is_another_stiffness_of_all_its_joints():
 
 
 def test_a_motor_that_is_off_has_no_command_and_none_of_its_torque(urdf_folder):
-    servos = ServoModelOptions(motor=MotorKindAndPreset("dc"))
-    plain = pendulum_step(urdf_folder, driven=JOINTS, servos=servos)
+    plain = pendulum_step(urdf_folder, driven=JOINTS, servos=ServoModelOptions(motor=MotorKindAndPreset("dc")))
     law = torque_law_from_tables("elbow", plain.system, tables(quantities=("command",)))
     with_law = compile_step(plain.system.with_effects([law]), H, use_compiler=False)
     commands = np.tile([0.4, -0.3], (40, 1))

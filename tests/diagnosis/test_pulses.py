@@ -26,8 +26,7 @@ def history(values: np.ndarray, seed: int = 0, noise: float = NOISE, **changed) 
 
 
 def bell(begin: float, end: float, size: float) -> np.ndarray:
-    part = np.clip((T - begin) / (end - begin), 0, 1)
-    return size * np.sin(np.pi * part) ** 2
+    return size * np.sin(np.pi * np.clip((T - begin) / (end - begin), 0, 1)) ** 2
 
 
 def sure(of: ForceEstimate, limits: Thresholds | None = None) -> list[DetectedForcePulse]:

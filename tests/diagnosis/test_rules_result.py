@@ -23,8 +23,7 @@ def test_effects_count_only_where_the_verdict_names_them(verdict):
     assert result["gap"]["closure"] == (0.9 if named else None)
     assert result["gap"]["closure_ci"] == ([0.8, 0.95] if named else [None, None])
     assert len(result["confusable"]) == (1 if named else 0)
-    after = result["gap"]["after"]["rmse"]
-    assert after == result["gap"]["before"]["rmse"] == {"points.tip": 0.01}
+    assert result["gap"]["after"]["rmse"] == result["gap"]["before"]["rmse"] == {"points.tip": 0.01}
 
 
 def test_numbers_that_are_not_finite_become_null():

@@ -187,8 +187,7 @@ def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size,
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    found = [detectable(signature(of, [c])) for c in (6.0, 8.0)]
-    assert [entry.is_detectable for entry in found] == [False, True]
+    assert [entry.is_detectable for entry in [detectable(signature(of, [c])) for c in (6.0, 8.0)]] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
@@ -276,8 +275,7 @@ def test_two_amplitudes_have_two_degrees_of_freedom():
     x = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 2.0]])
     r = np.array([-1.0, -2.0, -3.0])
     found = only(PAIR, x, r)
-    step = np.linalg.lstsq(x, -r, rcond=None)[0]
-    assert list(found.predicted_values.values()) == pytest.approx(step)
+    assert list(found.predicted_values.values()) == pytest.approx(np.linalg.lstsq(x, -r, rcond=None)[0])
     statistic = float(x.T @ r @ np.linalg.solve(x.T @ x, x.T @ r))
     assert found.lm_statistic == pytest.approx(statistic)
     assert found.p_value == pytest.approx(float(CHI2.sf(statistic, 2)))
@@ -286,14 +284,12 @@ def test_two_amplitudes_have_two_degrees_of_freedom():
 def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
     r = np.array([-1.5, -1.5, 0.0, 0.0])
     columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
-    at = point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns)))
-    [found] = scored(at)
+    [found] = scored(point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns))))
     alone = only(SHAPED, columns[1], r, s=0.2)
     assert found.predicted_values == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
     assert found.predicted_chi2_decrease == pytest.approx(4.5)
     assert found.p_value == pytest.approx(3 * alone.p_value)
-    none = point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns))
-    assert scored(none)[0].p_value == 1.0
+    assert scored(point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns)))[0].p_value == 1.0
 
 
 def test_scores_are_of_visible_candidates_and_the_most_promising_first():

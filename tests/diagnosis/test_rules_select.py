@@ -270,8 +270,7 @@ class Rounds:
 
     def refit(self, effects, start, name):
         self.refits.append((name, [of.kind for of in effects], start["k"]))
-        kinds = "".join(sorted(of.kind for of in effects))
-        return None if kinds in self.fails else self.fit(effects)
+        return None if "".join(sorted(of.kind for of in effects)) in self.fails else self.fit(effects)
 
     def compose(self, moved=False, is_late=False, **limits):
         self.thresholds, self.is_late = Thresholds(**limits), is_late
@@ -371,8 +370,7 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     monkeypatch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
     assert rounds.compose()[1] == ["a", "c"]
     # the first one may be larger, and what is in the place of one that is may be too
-    alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
-    assert alone.compose()[1] == ["b"]
+    assert Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)}).compose()[1] == ["b"]
 
 
 def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
@@ -419,8 +417,7 @@ def test_a_rest_that_is_hardly_more_than_noise_is_left(monkeypatch, least, whole
 )
 def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
     worse = tuple(9.0 for _ in nominal)
-    rounds = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse})
-    first, found, _ = rounds.compose(max_effects=1)
+    first, found, _ = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse}).compose(max_effects=1)
     assert (found, first[0]) == (chosen, "a")
 
 
@@ -584,8 +581,7 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
     assert sum(added[0].shares) == pytest.approx(1.0)
     assert added[0].shares[0] > added[0].shares[1] > 0.1, "the nearer, the likelier"
-    rivals = [(effect("b@x"), 0.8), (effect("c@x"), 0.3)]
-    effects, shares = select._equivalents_and_shares(effect("a@x"), rivals)
+    effects, shares = select._equivalents_and_shares(effect("a@x"), [(effect("b@x"), 0.8), (effect("c@x"), 0.3)])
     assert [of.kind for of in effects] == ["a", "c"], "what is unlikely is not named"
     assert shares == pytest.approx((0.8055, 0.1797), abs=1e-4)
 

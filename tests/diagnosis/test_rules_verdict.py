@@ -126,8 +126,7 @@ def judged(added=SINGLE, total=CERTAIN, explained=1.0, carried=True, **more):
     """What is said of effects that were added, of which the first explains nothing alone beside others."""
     effects = [entry.effect for entry in added]
     models = [explaining(explained if i == len(effects) else 0.0, effects[:i]) for i in range(1, len(effects) + 1)]
-    closures = [closed(0.1, 0.0, 0.2)] * (len(effects) - 1) + [total]
-    parts = zip(added, models, closures, strict=False)
+    parts = zip(added, models, [closed(0.1, 0.0, 0.2)] * (len(effects) - 1) + [total], strict=False)
     chosen = [replace(entry, refitted_model=model, cumulative_closure=part) for entry, model, part in parts]
     return judgement(chosen, None if carried else fit(effects), **more)
 

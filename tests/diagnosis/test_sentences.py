@@ -46,11 +46,14 @@ from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects import EFFECTS, EffectBase
+from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 SPEED, ACCELERATION, GRAVITY = "the speed", "the acceleration", "the orientation to gravity"
 REASONS = ("little", "stand_in")
+STEPS = {"stated_and_used_time_step": (0.01, 0.01)}
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 
@@ -120,17 +123,15 @@ def effects():
         rest = {"remaining_test": outcome(p=p, chi2=chi2), "remaining_gap_locations": where}
         yield f"remains chi2 {chi2}, p = {p}, {len(where)} places", with_effect(FRICTION, 0.5, **rest)
     for before, after in [(10.0, 11.1), (10.0, 8.9), (10.0, 11.0), (-10.0, -8.9), (0.0, 1e-9), (0.0, 1e-11)]:
-        moved = absorbing(FRICTION, **{"T1.bend": (before, after)})
-        yield f"moves from {before} to {after}", finding(**moved)
+        yield f"moves from {before} to {after}", finding(**absorbing(FRICTION, **{"T1.bend": (before, after)}))
     yield "eight parameters move", finding(**absorbing(FRICTION, **{f"p{i}": (1.0, 2.0) for i in range(8)}))
     yield "in blocks", with_effect(FRICTION, 0.5, is_split_in_blocks=True)
 
 
 def unknown():
     """Why a gap has no name, with the numbers that decide it."""
-    both = fit(
-        [FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25}, std={"offset@wrist.a": 0.2}
-    )
+    sizes = {"friction@elbow.a": 0.5, "offset@wrist.a": 0.25}
+    both = fit([FRICTION, OFFSET], values=sizes, std={"offset@wrist.a": 0.2})
     unsure = (added(FRICTION, fitted=fit([FRICTION], values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": 0.3})),)
     for name, reason, changed in [
         ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
@@ -162,10 +163,11 @@ def unknown():
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
-        yield f"followed for {kept} s", finding(truncated_recordings=(HeldOutTruncation("other", kept, 5.0),))
+        cut = (HeldOutTruncation("other", kept, 5.0),)
+        yield f"followed for {kept} s", finding(truncated_recordings=cut, **STEPS)
     yield "a finer step", finding("no_gap", stated_and_used_time_step=(0.01, 0.005))
     lost = (HeldOutTruncation("other", 0.0, 5.0),)
-    yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
+    yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True, **STEPS)
 
 
 def compared():
@@ -238,6 +240,14 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
 
 def test_a_diagnosis_says_what_is_written_down():
     assert said() == json.loads(FILE.read_text("utf-8"))
+
+
+def test_friction_is_to_be_fitted_law_by_law(monkeypatch):
+    kinds = {kind for own in EFFECT_KINDS_BY_FRICTION_LAW.values() for kind in own}
+    assert all(EFFECTS[kind].is_joint_friction for kind in kinds)
+    assert "yid-ocp friction" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+    monkeypatch.setattr(EffectBase, "is_joint_friction", True)
+    assert "`yid-ocp friction CONFIG` fits the friction" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():

@@ -114,9 +114,8 @@ def test_the_link_keeps_mass_and_inertia_wherever_a_search_goes() -> None:
             values[effect.parameters.names[0]] = (0.0, bounds[0][0])[k % 8 == 0]
         mass, com, tensor = (np.array(x) for x in function(system.parameters.vector(values)))
         assert mass[0, 0] > 0.05 * float(centre.mass)
-        spread = np.trace(tensor) / 2 * np.eye(3) - tensor
         # of a body: what it has about every axis is no less than nothing, and so the triangle inequalities hold
-        assert np.linalg.eigvalsh(spread)[0] > -1e-7
+        assert np.linalg.eigvalsh(np.trace(tensor) / 2 * np.eye(3) - tensor)[0] > -1e-7
         assert np.linalg.eigvalsh(tensor)[0] > 1e-5
         assert np.all(np.isfinite(com))
 
@@ -130,8 +129,7 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     assert near["my"].value == pytest.approx(0.2, rel=1e-3)
     assert near["my"].std == 0.01
     far = effect.to_reported_parameters(dict(zip(names, (1.0, 0.0, 3.0, 4.0), strict=True)), std)
-    most = np.hypot(0.5 * 1.0, 0.05 * 1.2)
-    assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(most, rel=1e-6)
+    assert np.hypot(far["my"].value, far["mz"].value) == pytest.approx(np.hypot(0.5 * 1.0, 0.05 * 1.2), rel=1e-6)
     assert np.isnan(far["my"].std)
     assert far["mass"].std == 0.01
     given = nominal.with_effects([make_effect("payload", "hand", nominal, {"mass": 1.0, "my": 3.0, "mz": 4.0})])
@@ -173,8 +171,7 @@ def test_places_for_a_mass() -> None:
     assert {"left_lower_shoulder", "left_wrist"} <= set(ends)
     assert set(ends) <= set(EFFECTS["point_mass"].candidate_locations(one))
     names = [f"panda_joint{i}" for i in range(1, 8)]
-    robot = read_urdf("package:panda", joints=names, exclude_links=["panda_hand"])
-    bare = System.build(robot, prescribed=names)
+    bare = System.build(read_urdf("package:panda", joints=names, exclude_links=["panda_hand"]), prescribed=names)
     assert one_frame_name_per_arm_link(bare)[-1] == "panda_link8"
     # joints 1 and 2 meet where nothing moves, 5 and 6 in one place
     assert sorted(frame_names_at_arm_link_ends(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]

@@ -95,8 +95,7 @@ def test_a_standard_linear_solid_relaxes_with_its_time_constant() -> None:
     effort, _ = follow(system, [effect], still(0.2, 60))
     t = H * np.arange(len(effort))
     # the first steady step has begun to creep already
-    expected = KAPPA * 0.2 * (1 + ratio * np.exp(-(t + H) / time))
-    assert effort == pytest.approx(expected, rel=0.02)
+    assert effort == pytest.approx(KAPPA * 0.2 * (1 + ratio * np.exp(-(t + H) / time)), rel=0.02)
     assert effort[-1] == pytest.approx(KAPPA * 0.2, rel=0.02)
 
 
@@ -105,8 +104,7 @@ def test_hysteresis_loses_energy_and_saturates() -> None:
     effect = make_effect("hysteresis", "T1", system, {"stiffness": stiffness, "yield_angle": angle})
     t = H * np.arange(801)
     path = 0.6 * np.sin(2 * np.pi * 0.5 * t)[:, None]
-    values = dict(zip(effect.parameters.names, (stiffness, angle), strict=True))
-    effort, _ = follow(system, [effect], path, values)
+    effort, _ = follow(system, [effect], path, dict(zip(effect.parameters.names, (stiffness, angle), strict=True)))
     nominal, _ = follow(system, [], path)
     friction = effort - nominal
     assert np.max(np.abs(friction)) == pytest.approx(stiffness * angle, rel=0.05)

@@ -96,8 +96,7 @@ def test_the_loaded_slopes_are_those_of_the_rows(step, folder):
 
     for name, parts, atol in (("rows_by_theta", (7,), 1e-7), ("rows_by_unknowns", (1, 4, 5), 1e-6)):
         expected = np.transpose([slope for which in parts for slope in slopes(which)])
-        found = loaded(folder, name).call(values)[0].full()
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=atol)
+        np.testing.assert_allclose(loaded(folder, name).call(values)[0].full(), expected, rtol=1e-5, atol=atol)
 
 
 def test_points_and_mechanics_are_the_models(step, folder):

@@ -167,8 +167,7 @@ def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
     models = [made(5, size=size), made(6, size=size, recording="second")]
     found = smoothed(monkeypatch, models)
     source = SOURCES[column]
-    at_work = {s: v for s, v in found.group_variance.items() if v}
-    assert set(at_work) == {source}
+    assert set({s: v for s, v in found.group_variance.items() if v}) == {source}
     best = max(Dense(models, NOTHING | {source: v}).log_evidence for v in np.geomspace(0.05, 400, 60))
     assert Dense(models, found.group_variance).log_evidence == pytest.approx(best, abs=0.15)
     reference, nothing = Dense(models, found.group_variance), Dense(models, NOTHING)

@@ -307,8 +307,7 @@ def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, at, kep
 
 @pytest.mark.parametrize("bound", [{"lower": 0.9}, {"lower": -np.inf, "upper": 1.1}])
 def test_beyond_a_bound_the_cost_is_not_asked(bound):
-    problem = MadeUp(linear([[1.0]], [-1.0]), **bound)
-    assert estimated(problem, [1.0], np.eye(1))["k0"].std == 1.0
+    assert estimated(MadeUp(linear([[1.0]], [-1.0]), **bound), [1.0], np.eye(1))["k0"].std == 1.0
 
 
 def estimated(problem, x, covariance, fit=GOOD):
@@ -483,8 +482,7 @@ CASES = [(tests, True) for tests in (*MORE, [(1.05, 1e-9), (1.2, 0.3)])] + [(tes
 
 @pytest.mark.parametrize(("tests", "said"), CASES)
 def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
-    made = [NullTestResult(ratio, 10.0, p, {}, ()) for ratio, p in tests]
-    assert residuals_exceed_noise(made) is said
+    assert residuals_exceed_noise([NullTestResult(ratio, 10.0, p, {}, ()) for ratio, p in tests]) is said
 
 
 def test_what_other_errors_did_is_whitened_and_the_rest_left_as_it_is():

@@ -164,8 +164,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
             along[j] = along[tree.joints[j].parent_index] + screws[j] * v[j]
         link = chain[-1]
         own = kinematics.joint_rotations[link] @ tree.joints[link].bodies[0].center_of_mass
-        com = own + kinematics.joint_origins[link]
-        reach = ca.horzcat(-ca.skew(com), ca.SX.eye(3))
+        reach = ca.horzcat(-ca.skew(own + kinematics.joint_origins[link]), ca.SX.eye(3))
         speed = reach @ along[link]
         wrench = reach.T @ (-c * ca.sumsqr(speed) * speed)
         slope = reach.T @ (-c * (ca.sumsqr(speed) * ca.SX.eye(3) + 2 * speed @ speed.T)) @ reach

@@ -109,8 +109,7 @@ def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder
 
     first, turned = swept(names), swept(names[::-1])
     np.testing.assert_array_equal(turned, first[:, :, ::-1])
-    derive = Mock(side_effect=AssertionError("derived again"))
-    monkeypatch.setattr(codegen, "parameter_jacobian_function", derive)
+    monkeypatch.setattr(codegen, "parameter_jacobian_function", Mock(side_effect=AssertionError("derived again")))
     np.testing.assert_array_equal(swept(names), first)
     with pytest.raises(AssertionError, match="derived again"):
         swept(("spin.mass",))

@@ -67,8 +67,7 @@ def runs(monkeypatch):
 @needs_compiler
 def test_the_second_compilation_reads_the_cache(cache, runs):
     assert compiler.compile_and_load_library(SOURCE % 42).yid_answer() == 42
-    compilations = [command for command in runs if "-shared" in command]
-    assert len(compilations) == 1
+    assert len([command for command in runs if "-shared" in command]) == 1
     assert [path.suffix for path in cache.iterdir()] == [".so"]
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     del runs[:]

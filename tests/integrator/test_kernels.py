@@ -97,8 +97,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     solved = exact.residual[:, step.model.index_tables.unknown_rows]
     assert np.max(np.abs(solved)) < 1e-9 * scale_of(rollout.multipliers)
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
-    fixed = list(step.system.prescribed_coordinate_indices)
-    effort = -exact.residual[:, fixed] / h
+    effort = -exact.residual[:, list(step.system.prescribed_coordinate_indices)] / h
     np.testing.assert_allclose(effort, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
 
     rng = np.random.default_rng(8)

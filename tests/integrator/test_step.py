@@ -44,16 +44,14 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
     errors, counts = [], (20, 40, 80, 160)
     for count in counts:
         step = compile_step(system, 0.5 / count)
-        times = np.arange(count + 1) * step.time_step
-        q, v, a = smooth(times)
+        q, v, a = smooth(np.arange(count + 1) * step.time_step)
         rollout = roll(step, theta, q[0], momentum(step, q[0], v[0], theta), count, path=q)
         assert rollout.status.is_converged, rollout.status.message
         needed = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
         errors.append(np.max(np.abs(rollout.effort[1:] - needed[1:-1])))
         # a start with its true momentum has felt only half a step of its effort
         assert np.max(np.abs(2 * rollout.effort[0] - needed[0])) < 60 * step.time_step
-    slope = np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0]
-    assert slope == pytest.approx(2.0, abs=0.1)
+    assert np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0] == pytest.approx(2.0, abs=0.1)
 
 
 def test_the_effort_of_a_clamp_is_the_pull_of_its_grasp(parts, roll):
@@ -220,8 +218,7 @@ class TestFailures:
         assert np.all(np.isnan(rollout.multipliers[7:]))
 
     def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
-        robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-        system = System.build(robot, prescribed=["shoulder", "elbow"])
+        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), prescribed=["shoulder", "elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         pair = ([0.1, 0.2], [0.11, 0.19])
         q1, p1, lam, status = step(pair[0], [0.0, 0.0], [], system.parameters.vector(), prescribed=pair)

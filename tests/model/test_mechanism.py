@@ -50,8 +50,7 @@ def places(tree: Mechanism, names, q=None, values=None):
 @pytest.mark.parametrize("links", [1, 2, 3, 4, 7, 8])
 @pytest.mark.parametrize("percent", [0.0, 10.0, 25.0, 33.3, 50.0, 99.0, 100.0])
 def test_a_percentage_is_that_part_of_the_length_however_many_links(links, percent):
-    tree = branched(links).mechanism
-    first, second, junction = places(tree, [f"T1:{percent:g}%", f"T2:{percent:g}%", "w_T1"])
+    first, second, junction = places(branched(links).mechanism, [f"T1:{percent:g}%", f"T2:{percent:g}%", "w_T1"])
     np.testing.assert_allclose(first[:3, 3], [0.1, 0.2, 0.3 + 0.8 * percent / 100], atol=1e-12)
     assert np.linalg.norm(second[:3, 3] - junction[:3, 3]) == pytest.approx(0.5 * percent / 100, abs=1e-12)
 
@@ -80,8 +79,7 @@ def test_points_stay_when_the_tree_is_put_together():
     found = places(tree, ["B:50%", "T1:40%"])
     np.testing.assert_allclose(found[0][:3, 3], [0.0, 0.0, 0.15], atol=1e-12)
     np.testing.assert_allclose(found[1][:3, 3], [1.1, 0.2, 0.15 + 0.3 + 0.32], atol=1e-12)
-    more = tree.with_joint_chain_added_at_index(2, [replace(tree.joints[0], name="extra")])
-    [again] = places(more, ["T1:40%"])
+    [again] = places(tree.with_joint_chain_added_at_index(2, [replace(tree.joints[0], name="extra")]), ["T1:40%"])
     np.testing.assert_allclose(again, found[1], atol=1e-12)
 
 

@@ -198,8 +198,7 @@ def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others
 
     def values(robot: str, arms: str, more: str = "") -> dict[str, float]:
         (tmp_path / "run.yaml").write_text(f"model:\n  robot: {robot}\n  arms: {arms}\n{more}")
-        system = build_system(load_config(tmp_path / "run.yaml"))
-        return {entry.name: entry.value for entry in system.parameters}
+        return {entry.name: entry.value for entry in build_system(load_config(tmp_path / "run.yaml")).parameters}
 
     found = values("robot.xml", "{joints: [joint1, joint2], mode: servo}")
     assert found["rotor_inertia@joint1.armature"] == 0.1

@@ -250,8 +250,7 @@ def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
 
 def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_with, limited_urdf):
     problem = problem_of(limited_urdf, free=("elbow.stiffness", "shoulder.damping"), prescribed=("shoulder",))
-    sensors = {"joints.effort": SensorOptions(use=False)}
-    blind = problem.with_options(replace(problem.options, sensors=sensors))
+    blind = problem.with_options(replace(problem.options, sensors={"joints.effort": SensorOptions(use=False)}))
     found = plan_informative_motion(blind, replace(OPTIONS, n_random_starts=1, max_iterations=3))
     assert set(found.unobservable_parameters) == {"shoulder.damping"}
     damping = found.parameter_precisions["shoulder.damping"]

@@ -138,8 +138,7 @@ def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, foun
     calm = plan_motion_to_target(moved, replace(wanted, duration=0.8, limits=PlanLimits(max_acceleration=bound)))
     assert calm.is_successful, calm.message
     assert np.abs(calm.joint_accelerations).max() <= bound * 1.001
-    strong = np.abs(found.joint_efforts).max()
-    share = 0.97 * strong / 40.0
+    share = 0.97 * np.abs(found.joint_efforts).max() / 40.0
     gentle = plan_motion_to_target(moved, replace(wanted, duration=0.8, limits=PlanLimits(effort_fraction=share)))
     assert np.abs(gentle.joint_efforts).max() <= share * 40.0 * 1.005, gentle.message
 

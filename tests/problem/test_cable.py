@@ -171,8 +171,7 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(twin_options, twin):
 def test_held_out_starts_use_no_frame_after_the_second(twin_options, cable, twin):
     step, options, recording = twin
     seen = recording.points[0].position.copy()
-    free = [recording.points[0].names.index(v) for v in cable.unclamped_vertex_names]
-    seen[2:, free] += 1.0
+    seen[2:, [recording.points[0].names.index(v) for v in cable.unclamped_vertex_names]] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = twin_options([recording, other], options, path_cutoff=8.0)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, None, [other])

@@ -175,8 +175,7 @@ def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     """Measured efforts are smoothed: a prediction that is not has other steps where the motion turns."""
     friction = [("joint_coulomb", "elbow", {"tau_c": 0.4})]
     step, path = pendulum_step(urdf_folder, friction, prescribed=JOINTS), motion()
-    effort = needed(step, path)
-    noisy = effort + 0.05 * np.random.default_rng(2).standard_normal(path.shape)
+    noisy = needed(step, path) + 0.05 * np.random.default_rng(2).standard_normal(path.shape)
     problem = arm(step, path, noisy, angle=0.0, std=0.05)
     found = problem.evaluate(problem.initial_unknowns, derivatives=False).residual
     assert found @ found / len(found) < 1.5
@@ -272,8 +271,7 @@ def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(efforts_of,
     t = 0.01 * np.arange(601)
     [samples] = efforts_of(np.stack([t, 2 - t], axis=1), np.inf, kind).episodes[0].measurements
     at = 0.01 * (samples.node + samples.fraction)[:, None]
-    expected = np.hstack([at - late, 2 - at + late])
-    np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
+    np.testing.assert_allclose(samples.value.reshape(len(at), 2), np.hstack([at - late, 2 - at + late]), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["sample", "mean", "command"])

@@ -309,8 +309,7 @@ def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples
     problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:]))
     assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
     step, made = driven(48)
-    group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
-    problem = sprung(step, replace(made, joints=group))
+    problem = sprung(step, replace(made, joints=replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))))
     errors = problem.episodes[0].input_errors
     assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
     assert problem.episodes[0].grid.time_step == H

@@ -74,8 +74,7 @@ UNEVEN = np.array([0.0, 0.1, 0.25, 0.3, 0.45, 0.5, 0.65])
 def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
     grid = TimeGrid(0.05, 0.02, 20)
     found = step_mean_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
-    expected = np.diff(summed_cubic(grid.node_times - delay)) / 0.02
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(found[:, 0], np.diff(summed_cubic(grid.node_times - delay)) / 0.02, rtol=1e-12)
 
 
 def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
@@ -169,8 +168,7 @@ def moving(*names):
 
 def test_a_prescribed_joint_follows_its_recorded_positions():
     t = 2.0 + 0.1 * np.arange(11)
-    position = np.stack([np.sin(t), t**2], axis=1)
-    made = recording(joints(["a", "b"], t, position))
+    made = recording(joints(["a", "b"], t, np.stack([np.sin(t), t**2], axis=1)))
     grid = TimeGrid(2.0, 0.025, 40)
     found = prescribed_coordinates_at_nodes(made, moving("b", "a"), grid, PLAIN)
     np.testing.assert_allclose(found[:, 0], grid.node_times**2, atol=1e-9)
@@ -212,11 +210,9 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
     made = clamped(np.zeros((steps + 1, 3)), direction, np.linspace(0.0, 1.0, steps + 1))
     path = path_of(made, TimeGrid(0.0, 1.0 / steps, steps))
     frames = Rotation.from_euler("XYZ", path[:, 3:])
-    turns = (frames[:-1].inv() * frames[1:]).as_rotvec()
-    assert np.abs(turns[:, 2]).max() < 1e-5
+    assert np.abs((frames[:-1].inv() * frames[1:]).as_rotvec()[:, 2]).max() < 1e-5
     # carried round a cone it comes back turned by the solid angle that it enclosed
-    cone = 2 * np.pi * (1 - 1 / math.sqrt(1.25))
-    assert abs(path[-1, 5] - path[0, 5]) == pytest.approx(cone, rel=1e-3)
+    assert abs(path[-1, 5] - path[0, 5]) == pytest.approx(2 * np.pi * (1 - 1 / math.sqrt(1.25)), rel=1e-3)
 
 
 def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
@@ -291,8 +287,7 @@ def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     impulse = np.zeros(5000)
     impulse[0] = 1.0
     response = np.abs(scipy.signal.sosfilt(sections, impulse))
-    late = response[round(settling / step) :].max()
-    assert 1e-4 < late / response.max() < 1e-2
+    assert 1e-4 < response[round(settling / step) :].max() / response.max() < 1e-2
     poles = np.log(scipy.signal.butter(4, cutoff * 2 * step, output="zpk")[1]) / step
     assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
 

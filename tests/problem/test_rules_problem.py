@@ -287,8 +287,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
         return np.concatenate([*(samples.whitened_residual(y).ravel() for samples, y in pairs), offset / std])
 
     best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=std, xtol=1e-12, ftol=1e-14)
-    found = held_out_prediction_arguments(problem, x)[1][2]
-    np.testing.assert_allclose(found / std, best.x / std, atol=2e-3)
+    np.testing.assert_allclose(held_out_prediction_arguments(problem, x)[1][2] / std, best.x / std, atol=2e-3)
 
 
 def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
@@ -306,8 +305,7 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
 
 def test_a_held_out_part_of_a_recording_shares_its_start_and_local_parameters(make):
     problem = make(initial_state="estimated", local_parameters=("elbow.rest",))
-    part = replace(problem.episodes[1], initial_state_shared_with=1)
-    split = problem.with_episodes(problem.episodes, [part])
+    split = problem.with_episodes(problem.episodes, [replace(problem.episodes[1], initial_state_shared_with=1)])
     x = problem.pack_unknowns({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
     assert held_out_prediction_arguments(split, x)[0][2].tolist() == problem.unpack_episode_unknowns(x, 1)[1].tolist()
     np.testing.assert_array_equal(

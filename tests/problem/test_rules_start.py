@@ -195,8 +195,7 @@ def test_known_starts_and_values_are_taken_as_they_are(step):
         parameters_by_recording={"run_4": {"elbow.rest": 0.5}},
     )
     problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
-    rollout = problem.evaluate([4.0], False).episode_predictions[0].rollout
-    np.testing.assert_array_equal(rollout.state[0], state)
+    np.testing.assert_array_equal(problem.evaluate([4.0], False).episode_predictions[0].rollout.state[0], state)
     theta = problem.predictor.theta_with_episode_values(problem.episodes[0], problem.theta)
     assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
     assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1

@@ -86,8 +86,7 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     sag = command - rest.state[:2]
     upper, lower = np.sin(rest.state[0]), np.sin(rest.state[0] + rest.state[1])
     weight = 9.81 * np.array([0.25 * upper + 0.6 * (0.5 * upper + 0.2 * lower), 0.6 * 0.2 * lower])
-    torque = saturated(np.array([60.0, 25.0]) * sag, [9.0, 3.0])
-    np.testing.assert_allclose(torque, weight, rtol=1e-8)
+    np.testing.assert_allclose(saturated(np.array([60.0, 25.0]) * sag, [9.0, 3.0]), weight, rtol=1e-8)
     still = simulate(step, theta, rest.state, 30, np.tile(command, (30, 1)))
     np.testing.assert_allclose(still.state, np.tile(rest.state, (31, 1)), atol=1e-9)
     for i in range(2):

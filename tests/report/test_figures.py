@@ -334,8 +334,7 @@ def test_long_curves_are_thinned_and_gaps_stay():
     measured = np.sin(t)
     measured[:10_000] = np.nan
     predicted, plot_data = {"predicted": np.sin(t)}, figures.channel_prediction_and_residual_plot_data
-    plots = plot_data("x", "m", t, measured, 0 * t + 1e-3, predicted)
-    figure = go.Figure(figures.time_plots_figure(plots))
+    figure = go.Figure(figures.time_plots_figure(plot_data("x", "m", t, measured, 0 * t + 1e-3, predicted)))
     assert max(len(trace.x) for trace in figure.data) <= 1200
     assert np.isnan(figure.data[0].y[0])
 

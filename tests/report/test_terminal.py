@@ -161,12 +161,15 @@ def test_an_interval_is_shown_of_every_number_that_is_known():
 def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
-    lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"]))
+    finer = {"links": "model.object.links: 8"}
+    lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"], finer_settings=finer))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    rest = "With half the time step, no estimate would change by more than its ± from the recordings (good)."
+    rest = "With half the time step, no estimate would change by more than its ± from the recordings."
     assert lines.index("it snaps") < (at := lines.index(said))
-    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set more links in model.object.", rest]
-    lines = told("yid-solve/1", solved(discretisation={name: own | {"links": None} for name, own in moved.items()}))
+    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set model.object.links: 8.", rest]
+    own = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
+    lines = told("yid-solve/1", solved(discretisation=own))
+    assert "This assumes that the noise is as stated (sensors.joints.position.std)," in " ".join(lines)
     assert not any("twice the links" in line for line in lines)
 
 
@@ -217,8 +220,7 @@ def test_a_simulation_that_failed_and_one_that_did_not():
 def test_blocks_on_a_terminal():
     table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
     assert terminal.summary_terminal_lines([]) == []
-    hidden = replace(table, is_page_only=True)
-    blocks = [table, SummaryStatement("said"), table, hidden, CodeBlock("do it\nnow")]
+    blocks = [table, SummaryStatement("said"), table, replace(table, is_page_only=True), CodeBlock("do it\nnow")]
     assert terminal.summary_terminal_lines(blocks) == [
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
@@ -246,6 +248,10 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     lines = told("yid-diagnosis/2", result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
     assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
+    unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
+    lines = told("yid-diagnosis/2", result | {"unseen": unseen})
+    at = next(i for i, line in enumerate(lines) if "would not show" in line)
+    assert "slip@grasp, friction (7 places), mass (7 places), " in " ".join(lines[at : at + 2])
     refitted = told("yid-diagnosis/2", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")

@@ -196,8 +196,7 @@ def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     rollout, scale = prediction.rollout, problem.theta[held.parameters.index(names[2])]
     speed = np.gradient(rollout.state[:, 1], H) * np.cos(rollout.state[:, 0]) / scale
     change = np.pad(np.diff(rollout.state[:, 1], 2), 1, mode="edge") / (H * scale) ** 2 * rollout.state[:, 0]
-    force = np.append(rollout.multipliers[:, 0], rollout.multipliers[-1, 0]) / H / scale
-    series = (speed, change, force)
+    series = (speed, change, np.append(rollout.multipliers[:, 0], rollout.multipliers[-1, 0]) / H / scale)
     expected = np.stack([np.interp([3, 7.5, 20, 40], np.arange(41), values) for values in series], axis=1)
     np.testing.assert_allclose(prediction.predicted_outputs[0], expected, rtol=1e-9, atol=1e-12)
     rows, gradient = problem.residual_rows.data, problem.cost_and_gradient(x)[1]

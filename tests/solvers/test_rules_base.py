@@ -632,6 +632,5 @@ def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
 
 @pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])
 def test_what_is_worth_a_standard_deviation_or_is_gained_is_none(steepness, pull):
-    problem = winding(steepness, pull, size=1.0)
-    found = GaussNewton(max_iterations=25).minimize_cost(problem, np.zeros(2), None)
+    found = GaussNewton(max_iterations=25).minimize_cost(winding(steepness, pull, size=1.0), np.zeros(2), None)
     assert not found.stopped_at_noise_level

@@ -150,8 +150,7 @@ def test_errors_of_cameras_are_those_of_the_table():
     turned = seen("camera_rotation", rx=0.0, ry=0.0, rz=0.1).position - centre
     assert np.linalg.norm(turned, axis=2) == pytest.approx(np.linalg.norm(true - centre, axis=2))
     assert seen("camera_latency", delay=0.1).t[0] == pytest.approx(0.1)
-    shift = seen("surface_offset", fraction=1.0).position - true
-    assert np.linalg.norm(shift, axis=2) == pytest.approx(0.032)
+    assert np.linalg.norm(seen("surface_offset", fraction=1.0).position - true, axis=2) == pytest.approx(0.032)
 
 
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():

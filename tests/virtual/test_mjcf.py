@@ -123,8 +123,7 @@ def system() -> System:
     item = flexible_object([FlexibleSegment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0), *branches])
     robot = read_urdf("default:double_pendulum.urdf")
     grasps = [Grasp("hold", "ceiling", "w_B")]
-    driven = robot.joint_names
-    return System.build(robot, objects=[(item, "tip", None)], grasps=grasps, driven=driven, damping=0.1)
+    return System.build(robot, objects=[(item, "tip", None)], grasps=grasps, driven=robot.joint_names, damping=0.1)
 
 
 def with_effect(system: System, kind: str, location: str, values: dict[str, float]) -> System:

@@ -28,8 +28,7 @@ def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction
     found, error = measured(alone, *filmed(SmoothY(), FRAMES, things), filters=COARSE)
     assert np.isfinite(error[:, 0, 0]).sum() >= junction * FRAMES
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.04
-    relative = np.abs(error / found.std)[np.isfinite(error)]
-    assert np.mean(relative < 2) > 0.9
+    assert np.mean(np.abs(error / found.std)[np.isfinite(error)] < 2) > 0.9
 
 
 def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):

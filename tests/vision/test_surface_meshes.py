@@ -89,8 +89,7 @@ def test_edges_have_holes_and_a_shadow_on_one_side(image):
 
 
 def test_outliers_are_as_many_as_asked_for(image):
-    camera = replace(vision.DepthCameraModel(), outlier_probability=0.2)
-    seen = inner(image(camera, 2.0))
+    seen = inner(image(replace(vision.DepthCameraModel(), outlier_probability=0.2), 2.0))
     assert (np.abs(seen - 2.0) > 0.04).mean() == pytest.approx(0.2 * 0.9, abs=0.02)
 
 

@@ -31,8 +31,7 @@ def test_points_at_two_metres(clean):
     assert clean.errors.max() < 15 * MILLIMETRE
     assert all((frame.cpu_seconds > 0) == (frame.shape_fit is not None) for frame in clean.track.frame_reports)
     # errors are within the stated standard deviations
-    truth = clean.truth(clean.track.t)
-    relative = (clean.track.position - truth) / clean.track.std
+    relative = (clean.track.position - clean.truth(clean.track.t)) / clean.track.std
     assert np.mean(relative**2) < 1.5
     assert np.abs(relative).max() < 4
     assert clean.track.std.max() < 20 * MILLIMETRE

@@ -24,6 +24,7 @@ from yid_ocp.model.servos_and_springs import MotorKindAndPreset
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.workflow.build import build_system, free_parameter_names
+from yid_ocp.workflow.build_problem import build_problem
 
 RATE = 125.0
 LENGTH = 0.5
@@ -205,6 +206,22 @@ def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     assert "effort_offset@roll.offset" in item.parameters
 
 
+def test_friction_without_efforts_is_refused_before_all_models_are_built(
+    bench: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[RunSettings] = []
+    monkeypatch.setattr("yid_ocp.workflow.friction.build_problem", lambda run: built.append(run) or build_problem(run))
+    proposed(moved(SHORT, effort=True))
+    write_recording(moved(SHORT, effort=True, seed=2), Path("two.h5"))
+    asked = ["friction", "run.yaml", "--set", "recordings.held_out=[two.h5]", "--set", "problem.use_compiler=false"]
+    for more, bias in ([], False), (["--set", "sensors.joints.effort.bias_std=null"], True):
+        assert main([*asked, *more]) == 2
+        told = capsys.readouterr().err
+        assert "set sensors.joints.effort.use: true" in told
+        assert ("true and, unless the torques have no constant error, bias_std there" in told) == bias
+    assert len(built) == 2
+
+
 def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
@@ -213,6 +230,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
+    assert "set both use: true and bias_std, the" in text
     assert "add {kind: effort_offset, location: JOINT} to\n" in text
     assert "#   efforts are taken as samples, since the recordings do not state it" in text
     Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))
@@ -409,8 +427,12 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.Ca
     columns = {"r": "position:roll", "p": "position:pitch", "ax": "x:tip", "ay": "y:tip", "az": "z:tip"}
     assert run.import_.column_meanings == columns
     assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
+    left = "/scan was left out (9 of Scan): its type is not known"
+    write_recording(replace(read_recording("again.h5"), notes=(left,)), "again.h5")
     assert main(["init", "wrist.urdf", "again.h5", "--out", "my run.yaml", *CABLE]) == 0
-    assert "yid-ocp check 'my run.yaml'" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"note: {left}" in said
+    assert "yid-ocp check 'my run.yaml'" in said
     assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
 
 

@@ -205,9 +205,8 @@ def point_clock_offset_drift_and_rms_error(
         return late, 0.0, math.sqrt(square)
     trials = np.linspace(-_MAX_DRIFT, _MAX_DRIFT, 1 + 2 * int(np.clip(_MAX_DRIFT * span / _DRIFT_SEARCH_STEP, 10, 100)))
     _, late, drift = min((*nearest(float(rate), (width / 48, 12), (width / 400, 8)), float(rate)) for rate in trials)
-    fine = scipy.optimize.minimize(
-        lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
-    )
+    begin = [late, drift * span]
+    fine = scipy.optimize.minimize(lambda x: min(error(x[0], x[1] / span), 1e300), begin, method="Nelder-Mead")
     return float(fine.x[0]), float(fine.x[1]) / span, math.sqrt(fine.fun)
 
 

@@ -40,7 +40,6 @@ _MAX_FINER_FIT_ITERATIONS = 3
 _MAX_LINEAR_CHANGE, _MAX_REFUTING_CHANGE = 1.0, 10.0
 _REFINEMENT_DESCRIPTIONS = {"links": "twice the links", "time_step": "half the time step"}
 _MIN_NOTED_SHARE, _MIN_NOTED_FALL = 0.25, 0.05  # of the misfit beyond noise that is removed; of chi2 per sample
-_REFINED_SETTINGS = {"links": "double `links` of the segments in model.object", "time_step": "halve problem.time_step"}
 
 
 @dataclass(frozen=True)
@@ -302,6 +301,15 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
     return fine.with_episodes(episodes, (), filters)
 
 
+def finer_setting_texts(problem: EstimationProblem) -> dict[str, str]:
+    """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise."""
+    options, divided = problem.options, problem.options.divided_links_model
+    found = {"links": divided.setting_text} if divided is not None and divided.setting_text else {}
+    found["time_step"] = f"problem.time_step: {problem.step.time_step / 2:g}"
+    cutoff = f"problem.path_cutoff: {options.path_cutoff / 2:g}" if options.path_cutoff else ""
+    return found | {"encoder_noise": cutoff}
+
+
 def parameter_shifts_at_finer_discretisation(
     problem: EstimationProblem,
     x: Array,
@@ -318,7 +326,7 @@ def parameter_shifts_at_finer_discretisation(
     the shifts by shared free parameter, and notes on refinements that failed or would remove a quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
-    notes: list[str] = []
+    notes, settings = list[str](), finer_setting_texts(problem)
     for key in kinds:
         words = _REFINEMENT_DESCRIPTIONS[key]
         if key == "links" and (problem.options.divided_links_model is None or not problem.system.segment_layouts):
@@ -330,7 +338,7 @@ def parameter_shifts_at_finer_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            remedy = f"To see it, {_REFINED_SETTINGS[key]}, run `solve` again and compare the estimates."
+            remedy = f"To see it, set {settings[key]}, run `solve` again and compare the estimates."
             usable = "The estimates may be used, but their ± leaves this error out."
             notes.append(f"Whether {words} would change the estimates is unknown: {own}. {usable} {remedy}")
         else:
@@ -339,7 +347,7 @@ def parameter_shifts_at_finer_discretisation(
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
             if not model_difference_only and excess - rest > least:
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
-                notes.append(f"{said}. First {_REFINED_SETTINGS[key]}, and run `solve` again.")
+                notes.append(f"{said}. First set {settings[key]}, and run `solve` again.")
     if kinds and not model_difference_only and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()

@@ -294,8 +294,7 @@ def _predict_held_out_with_expected_errors(
 ) -> tuple[list[EpisodeAndPredictionOrFailure], dict[str, dict[str, float]]]:
     """Predict the held-out recordings, and compute by channel the rms errors that sensor and torque noise cause."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
-    pairs: list[EpisodeAndPredictionOrFailure] = []
-    expected: dict[str, dict[str, float]] = {}
+    pairs, expected = list[EpisodeAndPredictionOrFailure](), dict[str, dict[str, float]]()
     for episode, theta, offset in held_out_prediction_arguments(problem, x):
         outcome = predict(episode, theta, offset, False)
         pairs.append((episode, outcome))

@@ -271,8 +271,7 @@ class ExperimentVariantSensitivityBuilder:
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message, f"the experiment with {[*setup_changes] or 'no change'}")
-        slopes: dict[tuple[int, str, str], Array] = {}
-        by_joints: dict[int, Array] = {}
+        slopes, by_joints = dict[tuple[int, str, str], Array](), dict[int, Array]()
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
@@ -335,8 +334,7 @@ class ExperimentVariantSensitivityBuilder:
             system = self._welded(system, setup_changes - {"weld", "torque", "motion", "travel"})
         if not setup_changes & {"motion", "travel", "second_arm"}:
             return system, [self._cut(episode) for episode in self._corrected.episodes], []
-        made: list[Recording] = []
-        notes: list[str] = []
+        made, notes = list[Recording](), list[str]()
         for i, episode in enumerate(base.episodes):
             try:
                 recording, beyond = self._moved(system, episode, _MOTION_SEED + i, "travel" in setup_changes)

@@ -309,9 +309,8 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
     """Return parameters and combinations without information, and informed directions, sorted by their information."""
     relative, count = view.relative, len(view.names)
     hidden = view.alone * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0
-    found = [
-        _direction(view, np.eye(count)[i], f"{view.names[i]} is observed by no sensor") for i in np.flatnonzero(hidden)
-    ]
+    unseen = ((np.eye(count)[i], f"{view.names[i]} is observed by no sensor") for i in np.flatnonzero(hidden))
+    found = [_direction(view, *own) for own in unseen]
     rest = np.flatnonzero(~hidden)
     if len(rest):
         _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)

@@ -482,8 +482,7 @@ def _fitted(data: _Data) -> _EffortFit:
     columns, spread = _by_itself(data)
     loads, sizes = _loads(data)
     matrix, prior = np.concatenate([columns, loads], axis=2) / error[:, None], np.concatenate([spread, sizes])
-    independent = max(2 * _INDEPENDENT_SAMPLE_BANDWIDTH * (motion.t[-1] - motion.t[0]), 2.0)
-    weight = math.sqrt(min(1.0, independent / count))
+    weight = math.sqrt(min(1.0, max(2 * _INDEPENDENT_SAMPLE_BANDWIDTH * (motion.t[-1] - motion.t[0]), 2.0) / count))
     rows, target = weight * matrix.reshape(count * width, -1), weight * (needed / error).ravel()
     normal = rows.T @ rows + np.diag(1 / prior**2)
     neutral = np.arange(len(prior)) < width

@@ -333,8 +333,7 @@ def step_map_natural_frequencies(
     if not rest.is_converged:
         return UndampedStepMapFrequencies(np.zeros(0), message=rest.message)
     damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
-    undamped = np.where(damps, 0.0, theta)
-    without, values = (_eigenvalues(step, rest, known, own) for own in (undamped, theta))
+    without, values = (_eigenvalues(step, rest, known, own) for own in (np.where(damps, 0.0, theta), theta))
     if without is None or values is None:
         said = "not computed, because a step's equations are singular. Look for redundant grasps or massless links"
         return UndampedStepMapFrequencies(np.zeros(0), message=said)

@@ -64,8 +64,7 @@ def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Se
     """Convert scalar symbolic expressions to text. They contain no symbols but `variables` (k, 1), named by `names`."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = Counter(itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results))
-    written: list[tuple[str, int]] = []
-    shared: list[tuple[str, str]] = []
+    written, shared = list[tuple[str, int]](), list[tuple[str, str]]()
     for i, (op, parts, value) in enumerate(nodes):
         if op == ca.OP_INPUT:
             written.append((names[int(value)], _ATOM))
@@ -97,8 +96,7 @@ _Node = tuple[int, tuple[int, ...], float]  # operation, nodes that it takes, in
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
     """Return the function's instructions as nodes, each result in a node of its own, and the indices of the outputs."""
-    nodes: list[_Node] = []
-    at: dict[int, int] = {}
+    nodes, at = list[_Node](), dict[int, int]()
     results = [0] * count
     for i in range(function.n_instructions()):
         op, taken, given = function.instruction_id(i), function.instruction_input(i), function.instruction_output(i)

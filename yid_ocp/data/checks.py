@@ -289,8 +289,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
         size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
         known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
-        noise = 6 * float(np.median(known)) if len(known) else 0.0
-        least = max(QUALITY_LIMITS.min_point_travel, noise)
+        least = max(QUALITY_LIMITS.min_point_travel, 6 * float(np.median(known)) if len(known) else 0.0)
         moved.append((size / least, f"{group.name} moves by at most {size:.2g} m (at least {least:.2g} m is needed)"))
     if moved and max(moved)[0] < 1.0:
         advice = "record a motion. At rest, only weights and stiffnesses can be found"

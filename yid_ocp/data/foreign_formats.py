@@ -56,8 +56,7 @@ def column_meanings(
     """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
-    meanings: list[ColumnMeaning] = []
-    units: dict[tuple[str, str], None] = {}
+    meanings, units = list[ColumnMeaning](), dict[tuple[str, str], None]()
     for name, unit in split:
         meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
         if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
@@ -133,8 +132,7 @@ def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str]
 
 def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     """Read positions of rigid bodies and markers from an export of Motive. Rotations and fit errors are omitted."""
-    head: list[list[str]] = []
-    body: list[list[str]] = []
+    head, body = list[list[str]](), list[list[str]]()
     for _, cells in rows:
         (body if head and head[-1][:1] == ["Frame"] else head).append([cell.strip() for cell in cells])
     said = dict(zip(head[0][::2], head[0][1::2], strict=False))
@@ -176,9 +174,7 @@ def _read_vicon(rows: _Rows, where: str) -> _MocapTable:
 
 def _read_qualisys(rows: _Rows, where: str) -> _MocapTable:
     """Read markers from an export of QTM (Qualisys). Three zeros mean that a marker was not seen."""
-    said: dict[str, list[str]] = {}
-    body: list[list[str]] = []
-    head: list[str] = []
+    said, body, head = dict[str, list[str]](), list[list[str]](), list[str]()
     for _, cells in rows:
         row = [cell.strip() for cell in cells]
         if not body and row[0] and not _is_number(row[0]):

@@ -322,8 +322,7 @@ def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
 def _foreign(group: h5py.Group, depth: int = 0) -> str:
     """Description of an entry that refers to another file, is a broken link or is nested too deeply. Empty if none."""
     for name in group:
-        link = group.get(name, getlink=True)
-        item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
+        item = None if isinstance(group.get(name, getlink=True), h5py.ExternalLink) else group.get(name)
         if item is None:
             return f"'{name}' in the HDF5 file is a link to another file, or a broken link"
         if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):

@@ -286,9 +286,7 @@ class BlindCaseGenerator:
         """Return the candidates' signatures on recordings without effects."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
-        *clean, other = [
-            self.simulate_synthetic_recording(self._draw_true_parameters(rng), (), rng, name) for name in names
-        ]
+        *clean, other = [self.simulate_synthetic_recording(self._draw_true_parameters(rng), (), rng, n) for n in names]
         problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [other])
@@ -396,8 +394,7 @@ class BlindCaseGenerator:
         times = min(wanted * DETECTABLE_AMPLITUDE_Z / seen, float(reach))
         values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
         reported = {name: told.value for name, told in effect.to_reported_parameters(values).items()}
-        relative_size = times * seen / DETECTABLE_AMPLITUDE_Z
-        return InjectedEffect(effect.kind, effect.location, reported), relative_size
+        return InjectedEffect(effect.kind, effect.location, reported), times * seen / DETECTABLE_AMPLITUDE_Z
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.simulated_system

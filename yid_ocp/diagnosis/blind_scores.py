@@ -100,8 +100,7 @@ def score_blind_case(
         right = verdict == "unknown" and located
     else:
         right = bool(true) and _found(true, named if label.category == "pair" else named[:1], groups)
-    errors: dict[str, tuple[float, bool]] = {}
-    z: dict[str, float] = {}
+    errors, z = dict[str, tuple[float, bool]](), dict[str, float]()
     for effect in label.injected:
         if effect.label not in named or effect.kind not in EFFECTS:
             continue
@@ -152,9 +151,8 @@ def _found(
         return True
     small = [group for group in groups if len(group) <= most]
     sets = [{name, *(label for group in small if name in group for label in group)} for name in named]
-    return any(
-        true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups, most) for i, own in enumerate(sets)
-    )
+    left = ([*named[:i], *named[i + 1 :]] for i, own in enumerate(sets) if true[0] in own)
+    return any(_found(true[1:], others, groups, most) for others in left)
 
 
 def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
@@ -532,11 +530,9 @@ class _RecordedCase:
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:
     kind, _, location = label.partition("@")
-    definitions = tuple(dataclass_from_plain_data(ParameterDefinition, own) for own in data)
-    entries = (
-        Parameter(f"{label}.{q.name}", q.neutral_value, q.unit, q.lower, q.upper, q.description) for q in definitions
-    )
-    return EFFECTS[kind](kind, location, Parameters(entries), definitions=definitions)
+    defined = tuple(dataclass_from_plain_data(ParameterDefinition, own) for own in data)
+    made = (Parameter(f"{label}.{q.name}", q.neutral_value, q.unit, q.lower, q.upper, q.description) for q in defined)
+    return EFFECTS[kind](kind, location, Parameters(made), definitions=defined)
 
 
 def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -555,8 +551,7 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
     case = _RecordedCase(data)
     try:
-        search = _RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record)
-        judged = judge(search, case.evidence)
+        judged = judge(_RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record), case.evidence)
     except _UnrecordedRefitError:
         judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, ())
     where = case.located_gap

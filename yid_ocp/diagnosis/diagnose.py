@@ -262,10 +262,8 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
         return -math.inf
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
     rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
-    before, after = (
-        [float(r[at] @ r[at]) - np.count_nonzero(r[at]) for at in part]
-        for r, part in zip((fit.evaluation.residual, left), rows, strict=True)
-    )
+    pairs = zip((fit.evaluation.residual, left), rows, strict=True)
+    before, after = ([float(r[at] @ r[at]) - np.count_nonzero(r[at]) for at in part] for r, part in pairs)
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
@@ -314,7 +312,7 @@ def _followed(
         composed = replace(search.problem, problem=nominal.problem)
         composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, fraction)
         for cut in cuts:
-            search.progress.begin_stage(held_out_truncation_message(cut))
+            search.progress.begin_stage(held_out_truncation_message(cut, nominal.problem.step.time_step))
             found[cut.recording] = cut
         search = replace(search, problem=composed)
         name = f"the nominal model, limited to the part that it can follow ({fraction:g})"

@@ -146,9 +146,8 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
     """Convert the verdict of a diagnosis and the evidence for it to a JSON-compatible dictionary."""
     added = judged.accepted_selected_effects
-    before = _errors_to_dict(seen.nominal_model) | attributes_to_dict(
-        seen.nominal_held_out_test, "chi2_per_dof p_value"
-    )
+    test = attributes_to_dict(seen.nominal_held_out_test, "chi2_per_dof p_value")
+    before = _errors_to_dict(seen.nominal_model) | test
     rivals = [entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1]
     found = {
         "verdict": judged.verdict,

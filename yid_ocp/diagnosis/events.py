@@ -386,8 +386,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
         std = float(expand_to_joint_values(given, joints.names, (joint,), f"sensors.{group}.std")[0])
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
         # smoothing reduces the noise of one sample by its share of the filter's time
-        share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
-        std /= min(math.sqrt(share), 1.0)
+        std /= min(math.sqrt(2 * options.path_cutoff * float(np.median(np.diff(joints.t)))), 1.0)
     return std
 
 

@@ -202,10 +202,8 @@ class RefitContext:
 
     def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:
         """Refit the model with the given effects. None if no simulation succeeds. `name` distinguishes the starts."""
-        asked = (effects, start, self.store, name, self.thresholds)
-        return self._answer(
-            self.record.refits, name, lambda: refit_with_effects(self._problem_of_round(effects), *asked)
-        )
+        how = (effects, start, self.store, name, self.thresholds)
+        return self._answer(self.record.refits, name, lambda: refit_with_effects(self._problem_of_round(effects), *how))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
         """Fit the effects of `fit` again, on the held-out recordings. None if that is not possible."""

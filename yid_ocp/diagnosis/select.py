@@ -74,9 +74,8 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> HeldOutGapC
     count = len(before.block_sample_counts)
     draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
     n = before.block_sample_counts[draws].sum(axis=1)
-    g0, g1 = (
-        np.maximum((loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2) / n - 1.0, 0.0) for loss in (before, after)
-    )
+    chi2 = (loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2 for loss in (before, after))
+    g0, g1 = (np.maximum(total / n - 1.0, 0.0) for total in chi2)
     low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975])
     return HeldOutGapClosure(fraction, float(low), float(high))
 

@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text, p_value_text
+from yid_ocp.display import abbreviated_names_text, p_value_text, unseen_effects_sentence
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
@@ -67,14 +67,16 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
         (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
     text += [] if result.law is None else [result.law.sentence]
-    text += [*map(held_out_truncation_message, result.truncated_recordings), *_bound_by_priors(result)]
-    text += _earlier_runs(result)
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    links = "The diagnosis subtracted the error from too few links. For other commands, double `links` in model.object."
+    step = result.stated_and_used_time_step[1]
+    text += [held_out_truncation_message(cut, step) for cut in result.truncated_recordings]
+    text += [*_bound_by_priors(result), *_earlier_runs(result)]
+    finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
+    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
+    links = "The diagnosis subtracted the error from too few links. For other commands, set "
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
-    text += [f"{step} (set problem.time_step: {used} for other commands)." * (stated != used)]
-    text += [links * result.is_corrected_for_links, blocks * result.is_split_in_blocks]
+    text += [f"{finer} (set problem.time_step: {used} for other commands)." * (stated != used)]
+    text += [links + f"{divided.setting_text}." if divided else "", blocks * result.is_split_in_blocks]
     kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
     where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
     told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
@@ -84,10 +86,10 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     return "\n".join(filter(None, text))
 
 
-def held_out_truncation_message(cut: HeldOutTruncation) -> str:
+def held_out_truncation_message(cut: HeldOutTruncation, time_step: float) -> str:
     """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
     used = f"Only {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}' are used"
-    return f"{used}, because its simulation then fails. To use more, halve problem.time_step."
+    return f"{used}, because its simulation then fails. To use more, set problem.time_step: {time_step / 2:.4g}."
 
 
 def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
@@ -138,8 +140,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    blind = _listed("These motions would not show these effects, even if they exist: ", unseen, max_entries=len(unseen))
-    return [small * is_significant, narrow * (along < level), blind]
+    return [small * is_significant, narrow * (along < level), unseen_effects_sentence(unseen)]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
@@ -186,7 +187,10 @@ def _causes(result: DiagnosisResult) -> list[str]:
         "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
         "stand_in": f"{none} {size}{apart}. {either}.",
     }
-    return [*text, reasons[result.unknown_reason], _several_places(result)]
+    laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
+    alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
+    alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
+    return [*text, reasons[result.unknown_reason], alone * bool(laws), _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:

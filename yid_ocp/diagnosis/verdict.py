@@ -113,8 +113,7 @@ class Judgement:
 
     def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
         """Return this judgement if changes explain as much (BIC difference: `select.bic_difference_per_threshold`)."""
-        share = select.relative_probability(bic_difference)
-        rivals, probability = tuple(names), self.probability * share
+        rivals, probability = tuple(names), self.probability * select.relative_probability(bic_difference)
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
@@ -148,8 +147,7 @@ class Judgement:
         For k independent effects (every local one, every other kind) it is 1 - (1 - `of_one`)^k: each explains a part.
         """
         effects = (entry.effect for entry in self.selected_effects)
-        independent = {effect.label if effect.is_local else effect.kind for effect in effects}
-        return 1.0 - (1.0 - of_one) ** len(independent)
+        return 1.0 - (1.0 - of_one) ** len({effect.label if effect.is_local else effect.kind for effect in effects})
 
     def explained_and_required_fractions(self, limits: Thresholds) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the explained and the required fraction of the gap, of fitted r'r and of held-out errors.
@@ -217,8 +215,7 @@ def _probability(said: Judgement, limits: Thresholds) -> float:
     (fitted, least), (closed, goal) = said.explained_and_required_fractions(limits)
     left = min(1.0 - fitted, (1.0 - closed) * (1.0 - least) / (1.0 - goal))  # the first if there is no closure
     unexplained = 1.0 if said.undetermined_sizes(limits) else max(left, _MIN_UNEXPLAINED)
-    margin = math.log((1.0 - least) / unexplained)
-    return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * margin))
+    return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * math.log((1.0 - least) / unexplained)))
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:

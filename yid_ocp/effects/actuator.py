@@ -173,9 +173,7 @@ class _EffortGain(_DistortedEffort):
         # efforts are linear in scale, driving torques in 1/scale: in both cases a flipped sign is a distance of two
         [name] = self.parameters.names
         value = start.get(name, 1.0)
-        if abs(value - 1) < 1:
-            return None
-        return {name: 1.0 if value < 0 else -1.0}
+        return None if abs(value - 1) < 1 else {name: 1.0 if value < 0 else -1.0}
 
     def reading_from_true_value(self, channel: str, output: ca.SX, state: NodeStateSymbols) -> ca.SX:
         return output / self["inverse"] if self._is_own(channel) else output

@@ -41,6 +41,7 @@ class _JointFriction(EffectBase):
     sign_smoothing_speed: float = SIGN_SMOOTHING_SPEED  # v_s [rad/s]
 
     required_excitation = "the speed"
+    is_joint_friction = True
     possible_locations = base.arm_joint_names
 
     @property
@@ -161,6 +162,7 @@ class _JointPresliding(EffectBase):
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
     required_excitation = "the speed"
+    is_joint_friction = True
     possible_locations = base.arm_joint_names
     declared_parameters = (
         effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),

@@ -77,8 +77,7 @@ class ResidualDerivativesByStateAndEffort:
         """
         step, theta = trajectory.model_functions.step, trajectory.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
-        found: list[IntArray] = []
-        parts: list[tuple[Array, ...]] = []
+        found, parts = list[IntArray](), list[tuple[Array, ...]]()
         readings = []
         for samples in trajectory.measurements:
             read_sensor = trajectory.model_functions.compiled_sensor_function(samples.sensor)

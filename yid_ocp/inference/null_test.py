@@ -81,17 +81,15 @@ class NullTestResult:
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
     """Return the noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
-    found: dict[str, list[Array]] = {}
-    told: dict[str, tuple[str, int]] = {}
+    found, told = dict[str, list[Array]](), dict[str, tuple[str, int]]()
     for episode in problem.episodes:
         for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
                 told[channel] = samples.sensor.unit, samples.sensor.outputs_per_channel
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
-    return tuple(
-        AssumedChannelNoiseLevel(c, told[c][0], float(np.median(v)), told[c][1]) for c, v in joined.items() if len(v)
-    )
+    medians = {channel: float(np.median(values)) for channel, values in joined.items() if len(values)}
+    return tuple(AssumedChannelNoiseLevel(c, told[c][0], median, told[c][1]) for c, median in medians.items())
 
 
 def _variance_inflation(autocorrelation: Array) -> float:
@@ -119,8 +117,7 @@ def residual_chi2_null_test(
     count = sum(len(s.residual_indices) for s in series)
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
     effective = max(degrees - parameters, 1.0)
-    total = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series))
-    ratio = total / max(count - parameters, 1)
+    ratio = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series)) / max(count - parameters, 1)
     p_value = chi2_p_value(ratio * effective, effective)
     channels = {}
     for channel in dict.fromkeys(s.channel for s in series):
@@ -216,8 +213,7 @@ def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> fl
 def _windows(
     series: Sequence[OutputResidualIndices], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
-    raw: list[tuple[str, str, float, float]] = []
-    p_values: list[float] = []
+    raw, p_values = list[tuple[str, str, float, float]](), list[float]()
     merged: dict[tuple[str, str], list[OutputResidualIndices]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)

@@ -202,8 +202,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
         kept = share < 1 - 1e-6
         grown = np.where(kept, 1.0 / np.sqrt(np.where(kept, 1.0 - np.maximum(share, 0.0), 1.0)), 0.0)
         adjusted.append(root @ (axes * grown) @ axes.T @ (back @ total))
-    by_few = float(scipy.special.stdtrit(len(sums) - 1, 0.975) / scipy.special.ndtri(0.975))
-    scores = np.array(adjusted) * by_few
+    scores = np.array(adjusted) * float(scipy.special.stdtrit(len(sums) - 1, 0.975) / scipy.special.ndtri(0.975))
     return scores.T @ scores
 
 
@@ -211,8 +210,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     """Rows of the data in time blocks and, if there are enough, in recordings and in channels of recordings."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH))
-    blocks: dict[tuple[str, int], list[IntArray]] = {}
-    recordings: dict[str, list[IntArray]] = {}
+    blocks, recordings = dict[tuple[str, int], list[IntArray]](), dict[str, list[IntArray]]()
     channels: list[list[IntArray]] = []
     for series in null_test.channels_with_residual_indices(problem):
         channels.append([series.residual_indices])

@@ -405,8 +405,7 @@ def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLik
 
     An entry is None if the recording has no whitening filter (`problem_with_whitening_at`), or if its rollout fails.
     """
-    x = np.asarray(x, float)
-    found: list[tuple[Array, Array] | None] = []
+    x, found = np.asarray(x, float), list[tuple[Array, Array] | None]()
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
         parts = problem.unpack_episode_unknowns(x, i)

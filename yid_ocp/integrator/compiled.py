@@ -148,8 +148,7 @@ class CompiledKernel:
 
     def _split(self, group: Sequence[int], members: Sequence[RolloutInputs]) -> list[Sequence[int]]:
         """Split similar members into batches, independent of the number of threads (batches differ by rounding)."""
-        batches: list[Sequence[int]] = []
-        left = list(group)
+        batches, left = list[Sequence[int]](), list(group)
         fewest = max(_MIN_BATCH_SPEEDUP * (_BATCH_COST + _BATCH_COST_PER_COLUMN * _width(members[left[0]])), 2.0)
         if len(left) >= fewest:
             self._wished += sum(len(members[i].torque) for i in left)

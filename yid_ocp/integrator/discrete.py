@@ -233,8 +233,7 @@ class _Symbols:
         """Expressions in which symbols of the two nodes replace those of the midpoint."""
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         (q, v), (z, z_rate) = (((a + b) / 2, (b - a) / self.h) for a, b in ((self.q0, self.q1), (self.z0, self.z1)))
-        nodes = ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)
-        placed = ca.substitute(list(expressions), [midpoint], [nodes])
+        placed = ca.substitute(list(expressions), [midpoint], [ca.vertcat(q, v, z, z_rate, self.lam / self.h, z)])
         return [ca.densify(x) for x in placed] if dense else placed
 
 
@@ -247,9 +246,7 @@ def _summed_terms(
     state = MidpointStateSymbols(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
-    equations: dict[str, ca.SX] = {}
-    at_rest: dict[str, ca.SX] = {}
-    closed: list[ForceWithFactoredDerivatives] = []
+    equations, at_rest, closed = dict[str, ca.SX](), dict[str, ca.SX](), list[ForceWithFactoredDerivatives]()
     for effect in system.effects:
         terms = effect.step_terms(state)
         energy += terms.lagrangian

@@ -142,10 +142,8 @@ class EquilibriumSolver:
             if lowest is not None:
                 return self.solve(configuration, theta, torque, lowest, names)
         if guess is None:
-            kept = [*self._least_energy.items()][1 - _MAX_KNOWN_EQUILIBRIA :]
-            self._least_energy = {**dict(kept), sought: best}
-        q = self._configuration(w, given)
-        give = hold.give(q, system)
+            self._least_energy = {**dict([*self._least_energy.items()][1 - _MAX_KNOWN_EQUILIBRIA :]), sought: best}
+        give = hold.give(self._configuration(w, given), system)
         state, by_theta, by_posture = self._differentiate(w, theta, hold, h, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
         by_itself = bool(system.servos) and torque is not None
@@ -315,9 +313,7 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; limits and damping do not change the lowest equilibrium."""
     at = zip(system.driven, system.actuated_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     known = ((system.servos[name], part, q[i]) for name, i, part in at)
-    energies = [
-        0.5 * servo.gain * servo.position_error_beyond_dead_band(command, angle) ** 2 for servo, command, angle in known
-    ]
+    energies = [0.5 * s.gain * s.position_error_beyond_dead_band(command, angle) ** 2 for s, command, angle in known]
     return sum(energies, ca.SX(0))
 
 

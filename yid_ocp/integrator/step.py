@@ -381,8 +381,7 @@ def linearized_rollout_steps(
     a range of consecutive steps. Raises `numpy.linalg.LinAlgError` if the equations of a step are singular.
     """
     if loads is None:
-        rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
-        loads = np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0))
+        loads = np.zeros((sum(step.sizes[key] for key in ("n", "nz", "m")), 0)), np.zeros((step.sizes["n"], 0))
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))

@@ -91,9 +91,7 @@ def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
     """Compute the poses and screws of all joints at a configuration q (n, 1) [rad or m]."""
-    rotations: list[ca.SX] = []
-    origins: list[ca.SX] = []
-    screws: list[ca.SX] = []
+    rotations, origins, screws = list[ca.SX](), list[ca.SX](), list[ca.SX]()
     for j, joint in enumerate(mechanism.joints):
         rotation, origin = joint.placement.rotation, joint.placement.translation
         if joint.parent_index >= 0:
@@ -114,8 +112,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
     """Compute the first derivatives of the bodies' Lagrangian at joint velocities v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
-    velocity: list[ca.SX] = []
-    D: list[ca.SX] = []
+    velocity, D = list[ca.SX](), list[ca.SX]()
     for j, joint in enumerate(joints):
         above = velocity[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
         D.append(motion_cross_motion_product(above, S[j]) if joint.parent_index >= 0 else above)

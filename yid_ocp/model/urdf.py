@@ -164,8 +164,7 @@ def read_urdf(
         order.append(next(name for name in waiting if placed[name][0] is None or placed[name][0] in order))
         waiting.remove(order[-1])
 
-    parameters: list[Parameter] = []
-    made: list[Joint] = []
+    parameters, made = list[Parameter](), list[Joint]()
     for entry in order:
         carrier, at, source = placed[entry]
         own = {link: bodies[link] for link, (at_joint, *_) in frames.items() if at_joint == entry and link in bodies}
@@ -390,8 +389,7 @@ def _walk(
 ) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[str, Inertia], dict[str, tuple[_Carrier, Array, str]]]:
     """Kept joints, bodies by link, and for each link its carrier (kept joint or None), pose (4, 4) and parent link."""
     links = {link.name: link.inertial for link in robot.links}
-    joints: dict[str, tuple[_Carrier, Array, Any]] = {}
-    bodies: dict[str, Inertia] = {}
+    joints, bodies = dict[str, tuple[_Carrier, Array, Any]](), dict[str, Inertia]()
     frames: dict[str, tuple[_Carrier, Array, str]] = {}
     stack: list[tuple[str, _Carrier, Array, str]] = [(root, None, np.eye(4), "")]
     while stack:

@@ -172,8 +172,7 @@ def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[
         return [function(entry) for entry in entries]
     march = _March(min(_MAX_CONCURRENT_ITEMS, len(entries)), threading.Semaphore(_max_threads()))
     queue, guard = iter(range(len(entries))), threading.Lock()
-    results: dict[int, _Result] = {}
-    errors: dict[int, BaseException] = {}
+    results, errors = dict[int, _Result](), dict[int, BaseException]()
 
     def work() -> None:
         _THREAD_SHARE.march, _THREAD_SHARE.count = march, 1

@@ -96,9 +96,8 @@ class SplineMotionExperiment:
         t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
         impulse = np.cumsum(np.vstack([np.zeros((1, len(mover.moved_joint_indices))), rollout.effort]), axis=0)
         impulse = impulse * mover.step.time_step
-        begin, end = (
-            np.stack([np.interp(at, mover.node_times, x) for x in impulse.T], axis=1) for at in (t, t + period)
-        )
+        nodes = mover.node_times
+        begin, end = (np.stack([np.interp(at, nodes, x) for x in impulse.T], axis=1) for at in (t, t + period))
         effort = (end - begin) / period
         effort[t + period > duration + 1e-9] = rollout.effort[-1]  # the effort after the end is unknown
         columns = [joints.names.index(name) for name in system.prescribed]
@@ -205,10 +204,10 @@ class SplineMotionExperiment:
         if self.configured_problem.system.driven:
             joints = replace(joints, position_std=None)  # `_blur` represents the error of the motion
             sensors.pop(JOINT_POSITION_GROUP_NAME, None)
-        options = self._options(
+        said = self._options(
             huber_threshold=np.inf, weak_prior_geometric_std=0.0, weighting="whitened", sensors=sensors
         )
-        return self._problem(self.simulator.step, replace(recording, joints=joints), options)
+        return self._problem(self.simulator.step, replace(recording, joints=joints), said)
 
     @cached_property
     def scales_of_estimated_unknowns(self) -> Array:

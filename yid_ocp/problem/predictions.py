@@ -122,8 +122,7 @@ def rmse_unit_count_dicts_by_channel(
 
     For points, the error of a sample is the Euclidean distance.
     """
-    squares: dict[str, list[float]] = {}
-    units: dict[str, str] = {}
+    squares, units = dict[str, list[float]](), dict[str, str]()
     for result, episode in zip(results, episodes, strict=True):
         for own in channel_predictions(episode, result):
             square = np.sum(own.predicted_minus_measured**2, axis=1)

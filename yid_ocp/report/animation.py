@@ -322,15 +322,13 @@ def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t
 def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
     """Return recorded arms and points at times t (F,). A point is shown up to half a sample period from its sample."""
     system, joints = told.system, recording.joints
-    moved = {*system.driven, *system.prescribed}
-    sticks: list[_Stick] = []
+    moved, sticks = {*system.driven, *system.prescribed}, list[_Stick]()
     places, arm = np.full((len(t), 0, 3), np.nan), None
     if joints is not None and joints.position is not None and moved and moved <= {*joints.names}:
         moved_arms = _model_motion(replace(told, acting=()), t, _with_recorded_angles(told, recording, t))
         sticks, places = [own for own in moved_arms.sticks if not own.is_object_part], moved_arms.positions
         arm = moved_arms.arm
-    seen: dict[str, Array] = {}
-    fresh: dict[str, BoolArray] = {}
+    seen, fresh = dict[str, Array](), dict[str, BoolArray]()
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
         period, own_period = median_sample_period(t), median_sample_period(group.t)

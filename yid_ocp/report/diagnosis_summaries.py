@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, p_value_text
+from yid_ocp.display import abbreviated_names_text, locations_by_effect_kind, p_value_text, unseen_effects_sentence
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
@@ -70,8 +70,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield "Refitted candidates come first. Closure: part of the held-out error beyond noise that one alone removes."
     yield "Score: significance of a candidate before a refit. p: probability that noise alone gives such a score."
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
-    unseen = abbreviated_names_text(result.get("unseen", ()), float("inf")) if verdict != "no gap" else ""
-    yield f"These recordings would not show the following effects, even if they exist: {unseen}." if unseen else ""
+    unseen = result.get("unseen", ())
+    yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
+    rows = [("effect", "places"), *((k, ", ".join(own)) for k, own in locations_by_effect_kind(unseen).items())]
+    yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     for signals, kinds in result.get("not_candidates", {}).items():
         yield f"These effects were not tried, because no recording has the signal {signals}: {', '.join(kinds)}."
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
@@ -220,8 +222,7 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    runs = result["runs"]
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    runs, found = result["runs"], dict[str, list[Mapping[str, Any]]]()
     for entry in runs:
         for name, own in entry["parameters"].items():
             if own["value"] is not None:

@@ -44,6 +44,7 @@ _BASELINE_DESCRIPTIONS = {
 }
 _MAX_DIRECTIONS = 8
 _MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
+_MAX_INITIAL_MISFIT = 30.0  # rms error at initial values, in stds of noise, up to which `check` shows finer models
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
@@ -114,9 +115,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         if not entries:
             continue
-        error, noise = (
-            _rms([e[key][c] for e in entries for c in channels if c in e.get(key, {})]) for key in ("rmse", "expected")
-        )
+        told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
+        error, noise = map(_rms, told)
         known = [e["baselines"] for e in entries]
         names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
         guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
@@ -381,15 +381,21 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}" if convergence["message"] else ""
-    moved = discretisation_shift_sentences(result)
-    yield "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)" if moved else ""
-    yield from moved
+    misfit, moved, warnings = result["initial_misfit"], discretisation_shift_sentences(result), result["warnings"]
+    if misfit is not None and misfit > _MAX_INITIAL_MISFIT:
+        far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
+        far += "Tests of links and time step say little there: they are in result.json, and `solve` repeats them."
+        yield SummaryStatement(far, "verdict")
+    else:
+        fine = "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)"
+        yield from [fine, *moved] if moved else []
+        warnings = [*warnings, *convergence["warnings"]]
     yield from issue_summary_blocks(result)
-    yield from (SummaryStatement(f"warning: {text}", "verdict") for text in result["warnings"])
+    yield from (SummaryStatement(f"warning: {text}", "verdict") for text in warnings)
     ended = "No problem was found, so a run is possible."
     if not result["recordings"]:
         ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
-    if result.get("issues") or result["warnings"]:
+    if result.get("issues") or warnings:
         ended = f"A run is possible, but read the {'issues' if result.get('issues') else 'warnings'} above."
     yield SummaryStatement(ended, "conclusion")
 

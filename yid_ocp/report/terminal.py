@@ -124,10 +124,8 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
     """Return what recorded torques that a result does not use could tell. Empty if there are none."""
-    said = (
-        "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
-    )
-    return said if result.get("unused_efforts") else ""
+    use = "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
+    return use if result.get("unused_efforts") else ""
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -156,9 +154,8 @@ def misfit_summary_blocks(
                 relative = entry.get("std_relative")
                 std = entry["std"] if "std" in entry else relative and relative * abs(entry["value"])
                 if std is not None and std <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
-                    known.append(
-                        f"{name} = {uncertainty.value_and_uncertainty_text(entry['value'], std, None)} {entry['unit']}"
-                    )
+                    value = uncertainty.value_and_uncertainty_text(entry["value"], std, None)
+                    known.append(f"{name} = {value} {entry['unit']}")
             left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
             shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
             none = "Do not use the values, because none is known to within 10 % if ± includes the model error."
@@ -176,18 +173,21 @@ def misfit_summary_blocks(
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
     said = []
-    noise = ("encoder_noise", "more encoder noise", "lower problem.path_cutoff")
-    step = ("time_step", "half the time step", "shorten problem.time_step")
-    for key, words, remedy in (("links", "twice the links", "set more links in model.object"), step, noise):
+    kinds = {"links": "twice the links", "time_step": "half the time step"}
+    kinds["encoder_noise"] = "the stated encoder noise once more"
+    limits = " This assumes that the noise is as stated (sensors.joints.position.std), and tests for no other error."
+    for key, words in kinds.items():
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. To cure this, {remedy}.")
+            remedy = f" To cure this, set {setting}." if (setting := result.get("finer_settings", {}).get(key)) else ""
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{remedy}")
         elif tried:
-            said.append(f"With {words}, no estimate would change by more than its ± from the recordings (good).")
+            said.append(f"With {words}, no estimate would change by more than its ± from the recordings.")
+            said[-1] += limits if key == "encoder_noise" else ""
     return said
 
 

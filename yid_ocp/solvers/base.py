@@ -433,9 +433,8 @@ class _MultiStartSearch:
             message += ". Its weights ignore constant errors of sensors and clocks. gauss_newton includes them"
         if not finish.ok:
             return Status.FAILED, finish.message
-        ended = result.stopped_at_noise_level or linearized_residual.is_stationary_point(
-            self._best.weighted, result.x, finish
-        )
+        is_stationary = linearized_residual.is_stationary_point
+        ended = result.stopped_at_noise_level or is_stationary(self._best.weighted, result.x, finish)
         if status == Status.CONVERGED and not ended:
             stopped = f"the search stopped where the cost still falls ({message})"
             return Status.STALLED, f"{stopped}. Set a smaller tolerance, other initial values or another solver"

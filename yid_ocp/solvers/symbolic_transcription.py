@@ -242,8 +242,7 @@ class _Maker:
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
         self._w.assign_block_name("theta", theta[:, None], problem.shared_parameters)
-        constraints: list[MappedFunctionTerm] = []
-        residuals: list[ResidualTerm] = []
+        constraints, residuals = list[MappedFunctionTerm](), list[ResidualTerm]()
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
             last = shared + len(problem.local_parameters)

@@ -137,9 +137,7 @@ def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuild
 
 def _bend_law(law: Callable[[float, Array], Array]) -> _ForceBuilder:
     """Builder of an effect with the force law(size, q) of a segment's bending joints, those about x first."""
-    return lambda scene, model, segment, size: _joint_force(
-        scene.bend_joint_ids(model, segment), lambda q, v, t: law(size, q)
-    )
+    return lambda scene, model, of, size: _joint_force(scene.bend_joint_ids(model, of), lambda q, v, t: law(size, q))
 
 
 def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback:

@@ -106,9 +106,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
         "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
         "gravity": (system.gravity,),
         "grasp": (part for grasp in held for part in (grasp.held_orientation, grasp.holder_offset, grasp.axial_slip)),
-        "grasp_compliance": (
-            part for grasp in held for part in (grasp.compliance, grasp.relaxation_time) if part is not None
-        ),
+        "grasp_compliance": (part for g in held for part in (g.compliance, g.relaxation_time) if part is not None),
         "sprung_joint": system.joint_compliances.values(),
         "servo": (
             part

@@ -531,8 +531,7 @@ def _errors(
     if played.has_diverged:
         what, hint = "the replay in MuJoCo diverged", "set a smaller `timestep` under `option` in the MJCF text"
         raise ModelError(what, where=f"recording '{recording.name}'", allowed="finite positions and efforts", hint=hint)
-    found: dict[str, ReplayErrorAgainstRecording] = {}
-    t = joints.t - joints.t[0]
+    found, t = dict[str, ReplayErrorAgainstRecording](), joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9
     if not system.driven:
         inside &= (t >= _AT_ENDS) & (t <= t[-1] - _AT_ENDS)

@@ -191,9 +191,8 @@ class MovingArmSurface:
             error, normal, part = self.robot_surfaces.nearest_moving_surfaces(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
-        behind, now, later = (
-            self._part_poses_at_time(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
-        )
+        times = (t - _VELOCITY_TIME_STEP, t, t + _VELOCITY_TIME_STEP)
+        behind, now, later = (self._part_poses_at_time(at)[part[chosen]] for at in times)
         local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
         velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _VELOCITY_TIME_STEP)

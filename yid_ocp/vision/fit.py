@@ -230,10 +230,8 @@ class ShapeFitter:
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
         link = nearest_link_axis_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
-        node_link, _, _, distance = nearest_link_axis_projections(
-            tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION
-        )
-        return ~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong
+        at, _, _, distance = nearest_link_axis_projections(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
+        return ~(links[at] & (distance < 2 * tubes.radius[at])), ~wrong
 
     def _attempt(
         self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left

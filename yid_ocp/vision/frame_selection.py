@@ -204,8 +204,7 @@ def _none_good(
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:2]
     starts = [f"In {len(own)} of {len(frames)} frames, {'for example, ' * (len(set(own)) > 1)}" for own in often]
-    most = next((reasons[0] for reasons in often), "")
-    cause = _because(sizes, most.startswith(_MISFIT_REASONS))
+    cause = _because(sizes, next((reasons[0] for reasons in often), "").startswith(_MISFIT_REASONS))
     hint = "check track.camera_pose, track.point_cloud_unit and track.options.filters"
     of_cause = {
         "time stamp is": "set track.options.clock_offset_search.initial_stamp_minus_joint_time to the offset [s]",

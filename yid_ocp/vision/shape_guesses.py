@@ -239,8 +239,7 @@ class ShapeGuessFinder:
         self._axis = [np.array(joint.axis, float) for joint in tree.joints]
         self._turns = [joint.kind == "revolute" for joint in tree.joints]
         self._placed = [np.array(ca.DM(joint.placement.rotation)) for joint in tree.joints]
-        ends: dict[int, float] = {}
-        found: list[_Link] = []
+        ends, found = dict[int, float](), list[_Link]()
         for segment in system.segment_layouts:
             for joints, length in zip(segment.link_joints, lengths[segment.name], strict=True):
                 indices = tuple(tree.joint_index(joint) for joint in joints)

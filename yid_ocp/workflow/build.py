@@ -119,9 +119,8 @@ def urdf_reader_arguments(run: RunSettings) -> dict[str, Any]:
 def build_step(run: RunSettings, system: System | None = None) -> Step:
     """Compile the discrete Euler-Lagrange step of a run's system."""
     said, system = run.problem, build_system(run) if system is None else system
-    return compile_step(
-        system, said.time_step_or_10_ms, said.force_split, said.constraint_force_at, use_compiler=said.use_compiler
-    )
+    rule = said.force_split, said.constraint_force_at
+    return compile_step(system, said.time_step_or_10_ms, *rule, use_compiler=said.use_compiler)
 
 
 def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:

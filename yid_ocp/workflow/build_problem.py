@@ -84,7 +84,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
     divided: DividedLinksModel | None = None
     if item is not None and item.uniform_or_total_link_count is not None:
         scales = {name: float(build.link_division_parameter_scale(run, name, 2)) for name in parameters.names}
-        divided = DividedLinksModel(partial(_divided_links_step, run), scales)
+        divided = DividedLinksModel(partial(_divided_links_step, run), scales, item.divided_links_setting_text)
     kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     if cable is not None and item is not None:
         clamps = cable.clamp_pose_point_names
@@ -231,8 +231,7 @@ def _check_recordings(
     run: RunSettings, system: System, free: Sequence[str], estimate: Sequence[Recording], held_out: Sequence[Recording]
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
-    issues: list[Issue] = []
-    cable = cable_vertices_between_clamps(run)
+    issues, cable = list[Issue](), cable_vertices_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, free)
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
@@ -277,8 +276,7 @@ def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
 def _once(
     run: RunSettings, estimate: Sequence[Recording], held_out: Sequence[Recording], issues: list[Issue]
 ) -> tuple[list[Recording], list[Recording]]:
-    used: list[Recording] = []
-    others: list[Recording] = []
+    used, others = list[Recording](), list[Recording]()
     for recording in estimate:
         if same := _duplicate(used, recording):
             issues.append(replace(same[0], what=f"{same[0].what}, so these samples are used only once"))

@@ -58,10 +58,12 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         mechanics = _mechanics(run, step, problem, warnings)
         progress.begin_stage("testing whether links and time step are fine enough")
         convergence = _frequency_convergence(run, problem, warnings)
-        moved, shown = {}, {}
+        coarse = convergence["warnings"]
+        moved, shown, misfit = {}, {}, None
         if problem is not None:
             first = problem.evaluate(problem.initial_unknowns)
-            moved = _moves(problem, first, warnings, progress)
+            moved = _moves(problem, first, warnings, coarse, progress)
+            misfit = float(np.sqrt(np.mean(first.residual[problem.residual_rows.data] ** 2))) if first.ok else None
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
@@ -72,11 +74,13 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
+            "finer_settings": {} if problem is None else discretisation.finer_setting_texts(problem),
             "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
+            "initial_misfit": misfit,
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings))
+    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings + coarse))
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -177,19 +181,22 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
     return scenes
 
 
-def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress) -> dict[str, Any]:
+def _moves(
+    problem: EstimationProblem, at_x: Evaluation, warnings: list[str], coarse: list[str], progress: Progress
+) -> dict[str, Any]:
     x = problem.initial_unknowns
     growth = discretisation.alternating_error_growth_of_worst_recording(problem, x)
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
         said = "the model cannot be simulated with the initial parameters, so `solve` may fail. Set larger stiffnesses "
-        warnings.append(f"{said}(parameters.NAME.initial) or a smaller problem.time_step. The reason: {at_x.message}")
+        said += f"(parameters.NAME.initial) or problem.time_step: {problem.step.time_step / 2:g}"
+        warnings.append(f"{said}. The reason: {at_x.message}")
         return {}
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
-    warnings += notes
+    coarse += notes
     # the misfit of initial values does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
@@ -198,12 +205,13 @@ def _moves(problem: EstimationProblem, at_x: Evaluation, warnings: list[str], pr
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
     """Lowest natural frequencies with twice the links (`links`), and with half and a quarter of the `time_step`."""
+    found: dict[str, Any] = {"links": [], "time_step": [], "message": "", "warnings": []}
     system = build_system(run)
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
         message = "not computed, because a posture is needed, which comes from a recording"
-        return {"links": [], "time_step": [], "message": message}
+        return found | {"message": message}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:
@@ -214,25 +222,25 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     frequencies = step_diagnostics.step_map_natural_frequencies
     own = frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
-        return {"links": [], "time_step": [], "message": own.message}
+        return found | {"message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
         grow = f"at the first posture, {count_with_noun(own.n_unstable_modes, 'vibration')} of the model would grow in "
-        grow += "every step, so the simulation is unstable. Set a shorter problem.time_step, "
+        grow += f"every step, so the simulation is unstable. Set problem.time_step: {h / 2:g}, "
         warnings.append(f"{grow}{remedy}or a larger model.damping")
-    steps = [_row(h, own)]
+    found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
-    _warn(warnings, "the time step goes", " s", steps)
-    rows: list[dict[str, Any]] = []
-    count = None if run.model.object is None else run.model.object.uniform_or_total_link_count
-    if count is not None:
+    _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
+    count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
+    if item is not None and count is not None:
         other = build_system(run, link_division=2)
         known = zip(system.parameters.names, theta, strict=True)
         values = {own: x * link_division_parameter_scale(run, own, 2) for own, x in known if own in other.parameters}
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
-        rows = [_row(count, own), _row(2 * count, finer)]
-        _warn(warnings, "the number of links goes", "", rows)
-    return {"links": rows, "time_step": steps, "message": ""}
+        found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
+        links = f"the number of links goes from {count} to {2 * count}"
+        _warn(found["warnings"], links, item.divided_links_setting_text, rows)
+    return found
 
 
 def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:
@@ -240,12 +248,11 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 
 
-def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]]) -> None:
+def _warn(warnings: list[str], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row."""
-    coarse, fine, remedy = rows[0], rows[-1], "set a shorter problem.time_step" if unit else "use more links"
-    for i, (a, b) in enumerate(zip(coarse["hertz"], fine["hertz"], strict=False)):
+    for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False)):
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            change = f"from {coarse['value']:g} to {fine['value']:g}{unit}. If this vibration matters, {remedy}"
             limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
             moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
-            warnings.append(f"natural frequency {i + 1} changes from {moved} when {what} {change}")
+            change = f"natural frequency {i + 1} changes from {moved} when {when}"
+            warnings.append(f"{change}. If this vibration matters, set {remedy}")

@@ -115,6 +115,7 @@ class _RemainingTime:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
         self._usual, self._work, self._ahead = _USUAL_IMPORT_TIME, 0.0, math.nan
         self._begun, self.n_iterates, self._has_grown = time.monotonic(), 0, False
+        self._start_of_command = self._begun - import_time
         self._first: tuple[int, float] | None = None
 
     def begin_stage(self, work: float, ahead: float | None) -> None:
@@ -134,9 +135,13 @@ class _RemainingTime:
         self._work, self.n_iterates, self._first = work, 0, None
 
     def of_command(self) -> str:
-        """Return the text of the command's remaining time. Empty if its stages do not state their usual time."""
-        seconds, how = self.seconds_left(), "at least" if self._has_grown else "about"
-        return "" if math.isnan(seconds) else f", {how} {_format_duration(seconds)} left"
+        """Return the text of the command's remaining time. Empty if its stages do not state their usual time.
+
+        After a plan has grown, it is the elapsed time: a search that repeats its stages can grow many times.
+        """
+        if self._has_grown:
+            return f", {time.monotonic() - self._start_of_command:.0f} s so far"
+        return "" if math.isnan(seconds := self.seconds_left()) else f", about {_format_duration(seconds)} left"
 
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual

@@ -472,8 +472,7 @@ def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array
 
 
 def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) -> dict[str, _GroupNoise]:
-    found: dict[str, _GroupNoise] = {}
-    at = [recorded.names.index(name) for name in joints]
+    found, at = dict[str, _GroupNoise](), [recorded.names.index(name) for name in joints]
     for channel, unit, least in (("position", "rad", 1e-6), ("effort", "N m", 1e-3)):
         values = recorded.values_by_channel.get(channel)
         if values is not None:

@@ -138,9 +138,8 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
             std = files.to_json_types(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
     matrix, _ = uncertainty.unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
-    covariance = uncertainty.covariance_to_dict(
-        shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared]
-    )
+    stds = [fit.std[name] for name in shared]
+    covariance = uncertainty.covariance_to_dict(shared, matrix[: len(shared), : len(shared)], stds)
     return {"parameters": found, "covariance": covariance}
 
 

@@ -14,6 +14,8 @@ from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.sensors import SensorOptions
+from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import Solution, Status, fit_problem
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
@@ -36,21 +38,11 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
             for law in EFFECT_KINDS_BY_FRICTION_LAW
         }
-        estimating_on_all = friction_law_comparison.problem_estimating_from_all_recordings
-        problems = [estimating_on_all(build_problem(settings)) for settings in by_law.values()]
-        kinds = friction_law_comparison.recording_names_by_name_stem(problems[0])
-        if len(kinds) < 2:
-            allowed = "two recordings or more; with servos, recordings in which the motors are on"
-            hint = "list another motion under recordings.estimate or recordings.held_out"
-            what = f"each motion is held out in turn, which needs two recordings, but only {len(kinds)} can be used"
-            raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
-        rubbing = friction_joint_names(next(iter(by_law.values())), problems[0].system)
-        compared = [own.sensor for episode in problems[0].episodes for own in episode.measurements]
-        if {*rubbing} <= {*problems[0].system.prescribed} and not any(sensor.effort_joints for sensor in compared):
-            what = "the joints follow their measured angles, so friction shows only in torques, which are not used"
-            where, hint = run.setting_location("sensors"), "set sensors.joints.effort.use: true"
-            allowed = "recorded torques that the fit compares with the model"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+        settings, *others = by_law.values()
+        on_all = friction_law_comparison.problem_estimating_from_all_recordings
+        problem = on_all(build_problem(settings))
+        kinds = _testable_motion_kinds(settings, problem)  # before the other models are compiled
+        problems = [problem, *(on_all(build_problem(own)) for own in others)]
         problems = friction_law_comparison.problems_with_common_samples(problems)
         progress.begin_stage("fitting the friction laws, each also with one kind of motion left out in turn")
         parts = PartsDoneCounter(progress, len(problems) * (1 + len(kinds)), next(iter(by_law)))
@@ -91,6 +83,25 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         known = {"problem": problem, "solution": solution, "section_data": {"friction_clouds": clouds}}
         written = folder.write_result_and_report(run, progress, result, **known)
     return CommandOutcome(folder.path, written, None, best.is_converged)
+
+
+def _testable_motion_kinds(run: RunSettings, problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
+    """Return the recordings by kind of motion. Raises `DataError` if they cannot test the friction of the joints."""
+    kinds = friction_law_comparison.recording_names_by_name_stem(problem)
+    if len(kinds) < 2:
+        allowed = "two recordings or more; with servos, recordings in which the motors are on"
+        hint = "list another motion under recordings.estimate or recordings.held_out"
+        what = f"each motion is held out in turn, which needs two recordings, but only {len(kinds)} can be used"
+        raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
+    rubbing, compared = friction_joint_names(run, problem.system), problem.episodes[0].measurements
+    if {*rubbing} <= {*problem.system.prescribed} and not any(own.sensor.effort_joints for own in compared):
+        what = "the joints follow their measured angles, so friction shows only in torques, which are not used"
+        where, hint = run.setting_location("sensors"), f"set sensors.{JOINT_EFFORT_SENSOR_KEY}.use: true"
+        arm, said = problem.episodes[0].recording.joints, run.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
+        if said.bias_std is None and arm is not None and arm.effort_bias_std is None:
+            hint += " and, unless the torques have no constant error, bias_std there to its expected size [N m]"
+        raise DataError(what, where=where, allowed="recorded torques that the fit compares with the model", hint=hint)
+    return kinds
 
 
 def _law_result(

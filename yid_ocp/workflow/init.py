@@ -132,8 +132,7 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
-    options = import_recording.reader_options_from_arguments(arguments)
-    made: dict[Path, Recording | None] = {}
+    options, made = import_recording.reader_options_from_arguments(arguments), dict[Path, Recording | None]()
     for file in map(Path, arguments.files):
         if not import_recording.has_native_recording_suffix(file):
             recording = import_recording.read_third_party_recording(file, options, progress)
@@ -199,6 +198,7 @@ def _summary_lines(
     lines += [f"model.damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     for group, places in proposal.point_placements.items():
         lines += [f"sensors.{group}: {sentence}" for sentence in _place_sentences(places)]
+    lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
         lines.append(f"These recordings cannot show some effects ({', '.join(kinds)}). `diagnose` leaves them out.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis import estimation
+from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByDiscretisation, covariance_to_dict
@@ -54,6 +54,7 @@ def run_solve(
             "safeguard": checks.cable_memory_message,
             "covariance": _covariance_result(solution, checks.data_std),
             "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
+            "finer_settings": discretisation.finer_setting_texts(problem),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),

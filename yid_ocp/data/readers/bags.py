@@ -23,7 +23,7 @@ from yid_ocp.data.foreign_formats import (
 )
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
@@ -33,7 +33,8 @@ JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform"))
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_PLACES = (_POINT_STAMPED, *_POSES)
+_POSE_ARRAY = "geometry_msgs/msg/PoseArray"
+_PLACES = (_POINT_STAMPED, *_POSES, _POSE_ARRAY)
 _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
 _GROUP_BY_MESSAGE_TYPE = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
 _JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *OTHER_JOINT_MESSAGE_TYPES)
@@ -88,6 +89,8 @@ class OpenBag:
         try:
             with limit_process_memory():  # compressed data may state no size or a wrong one
                 yield
+        except DataError:
+            raise
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"
             what = "the bag cannot be read, because it is incomplete or damaged"
@@ -214,11 +217,14 @@ def _read_bag(
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and distance is None:
-        said = f"of {', '.join(sorted(turned))}, the orientations were not imported, only the positions. To keep them, "
-        said += "import again with --pose-axis-point-distance 0.1: it adds points 0.1 m away on the axes of each pose"
+        said = f"of {abbreviated_names_text(sorted(turned))}, the orientations were not imported, only the positions. "
+        said += "--pose-axis-point-distance 0.1 at the import keeps them as points 0.1 m away on the axes of each pose"
         more = (*more, said)
-    left = [f"{t.name} was left out ({t.n_messages} of {t.kind})" for t in bag.file.topics if t.name not in used]
-    left += ["`yid-ocp import --preview` says how to import a topic that was left out, if you need it"] * bool(left)
+    others = (_preview_source(topic, bag, _names_of(bag)) for topic in bag.file.topics if topic.name not in used)
+    left = [
+        f"{s.name} was left out ({s.n_samples} of {s.kind}): {'not selected' if s.imported_as else s.note}"
+        for s in others
+    ]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
@@ -230,8 +236,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
-    states = _default_joint_topics(bag.file)
-    owners: dict[str, set[str]] = {}
+    states, owners = _default_joint_topics(bag.file), dict[str, set[str]]()
     for message in (message for message in bag.states if message.source in states):
         for joint in message.content.name:
             owners.setdefault(joint, set()).add(message.source)
@@ -240,9 +245,9 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         notes.append(f"{', '.join(sorted(shared))} have joints in common. Choose one of these topics by --joint-topic")
     elif len(states) > 1:
         options["joint_topics"] = states
-    if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
+    if any(message.content.axes is not None for message in bag.places if message.source in names):
         notes.append("poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
-    units, why = base.guess_non_si_units(_for_guess(bag))
+    units, why = base.guess_non_si_units(_for_guess(bag, names))
     options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
@@ -258,7 +263,6 @@ def _contents(
     """Decode the usable messages of a bag. `trees` lists the frames of transform trees to decode (None: all)."""
     bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
     own_topic, paths = _topic_and_paths(bag, fields or {})
-    refused: DataError | None = None
     lists = {**dict.fromkeys(_JOINT_TYPES, states), **dict.fromkeys(_GROUP_BY_MESSAGE_TYPE, mounted)}
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     with bag.raise_read_errors_as_data_errors(), closing(bag.reader) as reader:
@@ -272,24 +276,24 @@ def _contents(
                 progress.report_parts_done(done, total, "messages")
             content: Any = reader.deserialize(data, connection.msgtype)
             if connection.topic == own_topic:
-                try:
-                    values = joint_values_from_message_fields(content, paths, f"{path}: {own_topic}")
-                except DataError as error:
-                    refused = error
-                    break
+                values = joint_values_from_message_fields(content, paths, f"{path}: {own_topic}")
                 states.append(BagMessage(own_topic, int(logged), _stamp(content), values))
                 continue
-            if connection.msgtype in _TREES:
-                for part in content.transforms:
-                    source = f"{connection.topic}:{part.child_frame_id.strip('/')}"
-                    if trees is None or source in trees:
-                        places.append(_message(source, logged, part, _POSES[2]))
-                continue
-            message = _message(connection.topic, logged, content, connection.msgtype)
-            lists.get(connection.msgtype, places).append(message)
-    if refused is not None:  # outside, where errors of reading are not meant
-        raise refused
+            for source, part, kind in _parts_of_message(connection.topic, content, connection.msgtype):
+                if connection.msgtype not in _TREES or trees is None or source in trees:
+                    lists.get(kind, places).append(BagMessage(source, int(logged), _stamp(part), _plain(part, kind)))
     return _Contents(bag, states, places, mounted, own_topic)
+
+
+def _parts_of_message(topic: str, content: Any, kind: str) -> Iterator[tuple[str, Any, str]]:
+    """Yield source, content and type of the frames of a tree or poses of an array; of others, the message itself."""
+    if kind in _TREES:
+        yield from ((f"{topic}:{part.child_frame_id.strip('/')}", part, _POSES[2]) for part in content.transforms)
+    elif kind == _POSE_ARRAY:
+        for i, pose in enumerate(content.poses):
+            yield f"{topic}:{i + 1}", SimpleNamespace(header=content.header, pose=pose), _POSES[0]
+    else:
+        yield topic, content, kind
 
 
 def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict[str, str]]:
@@ -317,10 +321,6 @@ def _default_joint_topics(bag: OpenBag) -> list[str]:
 def _stamp(content: Any) -> int:
     header = getattr(content, "header", None)
     return 0 if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-
-
-def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
-    return BagMessage(source, int(logged), _stamp(content), _plain(content, kind))
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
@@ -495,11 +495,18 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
 def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
-    """Names by topic, for topics of the types `kinds` (default: points): the last descriptive part of the topic."""
-    names = dict[str, str]()
+    """Names by source, for topics of the types `kinds` (default: points): the last descriptive part of the topic.
+
+    Poses of arrays have numbers. If arrays of a topic differ in length, a number is not always one point: no names.
+    """
+    names, counts = dict[str, str](), Counter(message.source for message in bag.places)
+    arrays = bag.file.topic_names_of_types(_POSE_ARRAY)
     for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]
-        names[topic] = ([part for part in parts if part.lower() not in _PLAIN_WORDS] or parts)[-1]
+        name = ([part for part in parts if part.lower() not in _PLAIN_WORDS] or parts)[-1]
+        own = [source for source in counts if source.partition(":")[0] == topic] if topic in arrays else [topic]
+        if len({counts[source] for source in own}) == 1:
+            names |= {source: name + source.removeprefix(topic).replace(":", "_") for source in own}
     return names
 
 
@@ -558,7 +565,7 @@ def _positions(
 
 def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.TopicOrColumnSummary:
     own = [m for m in (*bag.states, *bag.places, *bag.mounted) if m.source.partition(":")[0] == topic.name]
-    logged = [message.logged for message in own]
+    logged, frames = [m.logged for m in own], ", ".join(dict.fromkeys(m.content.frame for m in own))
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
     becomes, note = "", f"its type is not known. For joint values, add --field position={topic.name}.FIELD"
@@ -567,22 +574,22 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
-    elif topic.name in names:
-        frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
-        becomes, note = f"point {names[topic.name]}", f"in {frames}" if frames else ""
+    elif points := [name for source, name in names.items() if source.partition(":")[0] == topic.name]:
+        becomes, note = f"point {', '.join(points)}", f"in {frames}" if frames else ""
+    elif topic.kind == _POSE_ARRAY:
+        note = f"arrays of different lengths. To use a point of them, add --points {topic.name}:NUMBER=POINT"
     elif topic.kind in _GROUP_BY_MESSAGE_TYPE:
-        frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
         becomes, note = f"{_GROUP_BY_MESSAGE_TYPE[topic.kind]} on {frames or topic.name}", ""
     elif topic.kind in _TREES:
-        children = sorted({message.source.partition(":")[2] for message in own})
-        note = f"frames {', '.join(children)}. To use one, add --points {topic.name}:FRAME=POINT"
-    return base.TopicOrColumnSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
+        children = abbreviated_names_text(sorted({m.source.partition(":")[2] for m in own})) or "(see --preview)"
+        note = f"frames {children}. To use one, add --points {topic.name}:FRAME=POINT"
+    return base.TopicOrColumnSummary(*topic, rate, *((becomes, note) if topic.n_messages else ("", "no messages")))
 
 
-def _for_guess(bag: _Contents) -> Recording:
+def _for_guess(bag: _Contents, names: Mapping[str, str]) -> Recording:
     """Recording with the angles and points of a bag in their own units, from which the units are guessed."""
     widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
     joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None
-    own = np.array([m.content.point for m in bag.places if ":" not in m.source], float).reshape(-1, 1, 3)
+    own = np.array([m.content.point for m in bag.places if m.source in names], float).reshape(-1, 1, 3)
     points = (PointGroup("points", ("any",), np.arange(float(len(own))) * 1e-3, own),) if len(own) else ()
     return Recording(joints, points)

@@ -398,8 +398,7 @@ def _meanings(
             raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: dict[str, ColumnMeaning] = {}
-    meant: dict[tuple[str, str], str] = {}
+    meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
     by_name, stated = column_meanings(header, _COMPONENTS)
     units: dict[str, str] = {}
     for quantity, unit in stated:

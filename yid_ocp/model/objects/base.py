@@ -14,6 +14,7 @@ from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, Vector3
+from yid_ocp.display import abbreviated_names_text
 from yid_ocp.errors import ConfigError, ModelError, require_known_names
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
@@ -196,6 +197,7 @@ class ObjectBuilder:
 
     # whether `solve` repeats the estimate with twice the links; not if the links are part of the object's definition
     default_link_refinement: ClassVar[bool] = False
+    segment_key: ClassVar[str] = "model.object"  # of the settings of a segment, with {} for its name
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
@@ -224,6 +226,14 @@ class ObjectBuilder:
         """The number of links in each segment, or the total number if segments differ. None without segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.segment_definitions()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
+
+    @property
+    def divided_links_setting_text(self) -> str:
+        """The settings, with whole keys, that divide each link in two."""
+        halved = self.segment_definitions(link_division=2)
+        counts = [f"links: {s.links}" if s.link_lengths is None else f"link_lengths: {s.link_lengths}" for s in halved]
+        texts = [f"{self.segment_key.format(s.name)}.{count}" for s, count in zip(halved, counts, strict=True)]
+        return abbreviated_names_text(list(dict.fromkeys(texts)))
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Return the factor on a parameter that keeps its segment as stiff and damped if each link is divided."""

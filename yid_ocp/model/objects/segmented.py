@@ -173,6 +173,7 @@ class _SegmentedObject(MountedObjectBuilder):
     """A flexible object built from segments (cable, beam, tube with branches), on a robot or fixed in the world."""
 
     default_link_refinement = True
+    segment_key = "model.object.named_segments.{}"
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {
         "cable": InitObjectFactory(8, _cable),
         "beam": InitObjectFactory(6, _beam),
