@@ -246,9 +246,8 @@ def select_effects(
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
-        # more effects than allowed only tell how wrong the others may be; as many are tried
         is_full = len(base) >= limits.max_effects
-        if _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
+        if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
         search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
@@ -256,13 +255,13 @@ def select_effects(
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
         if promised < limits.min_explained_fraction * max(2 * nominal.cost - nominal.residual_count, 1.0):
             break
-        shortlist = _refit_shortlist(seen, limits)[: len(base) if is_full else None]
+        shortlist = _refit_shortlist(seen, limits)
         fits = refit_with_each_effect(search, base, shortlist, better.values)
-        if len(base) == 1 and not is_full:
+        if len(base) == 1:
             pairs = _pairs_to_refit(search, screened, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         later += [fit.statistics() for fit in fits]
-        near = [] if is_full else _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
+        near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before)
     if len(chosen.fit.effects) == 1:
         # its last fit may differ from its first one
