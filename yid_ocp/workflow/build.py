@@ -322,7 +322,7 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
         for joint in (name.rpartition(".")[0] for name in parameters.names if name.endswith(".servo_gain")):
             own = {f"{joint}.{name}": value for name, value in data.servo_values(constants).items()}
             own[f"rotor_inertia@{joint}.armature"] = data.armature
-            for name in own.keys() & set(parameters.names):
+            for name in filter(parameters.names.__contains__, own):
                 found[name] = ParameterSettings(initial=own[name], prior_std=_PRESET_RELATIVE_STD * own[name])
             if friction is not None:
                 values |= {
