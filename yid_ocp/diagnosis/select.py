@@ -139,8 +139,8 @@ def _near_best_models(
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:
-        plausible = [fit for fit in fits if not fit.implausible_parameters(fit.effects[-1], limits)]
-        plausible = [fit for fit in plausible if fit.determines_size(fit.effects[-1], limits.min_z)]
+        sized = [fit for fit in fits if fit.determines_size(fit.effects[-1], limits.min_z)]
+        plausible = [fit for fit in sized if not fit.implausible_parameters(fit.effects[-1], limits)]
         most = (1 - limits.min_explained_fraction) * nominal.held_out_loss.excess_chi2_per_sample
         best_plausible = min(plausible, key=_chi2, default=nominal)
         if best_plausible.held_out_loss.excess_chi2_per_sample <= most:
