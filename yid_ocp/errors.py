@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
@@ -37,7 +38,8 @@ class YidError(Exception):
         room, parts = _MAX_MESSAGE_LENGTH, len(shown)
         for key, text in sorted(shown.items(), key=lambda item: len(item[1])):  # short ones leave room to long ones
             half = (room // parts - 5) // 2
-            shown[key] = text if len(text) <= room // parts else f"{text[:half]} ... {text[-half:]}"
+            begin, end = re.sub(r" \S{,40}$", "", text[:half]), re.sub(r"^\S{,40} ", "", text[-half:])  # whole words
+            shown[key] = text if len(text) <= room // parts else f"{begin} ... {end}"
             room, parts = room - len(shown[key]), parts - 1
         return shown
 

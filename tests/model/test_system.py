@@ -207,13 +207,14 @@ def test_an_error_has_its_parts_on_lines_of_their_own():
 
 
 def test_a_long_error_is_shortened_where_it_is_long_and_obeyed_by_no_terminal():
-    error = ModelError("what \x1b[2J\n  where: elsewhere", where="here", allowed="a" * 100_000, hint="h" * 300)
+    error = ModelError("what \x1b[2J\n  where: elsewhere", where="here", allowed="a" * 100_000, hint="a_name, " * 40)
     assert len(str(error)) <= 600
     assert str(error).isprintable() == (str(error).count("\n") == 0)
     what, where, allowed, hint = str(error).split("\n")
     assert (what, where) == (r"what \x1b[2J\n  where: elsewhere", "  where: here")
     assert " ... " in allowed
     assert len(hint) > 200
+    assert set(hint.split()) == {"try:", "a_name,", "..."}
 
 
 def test_nearest_name():
