@@ -137,7 +137,9 @@ def require_known_names(
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
     plain = {entry.lower(): entry for entry in reversed(names)}
-    return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
+    near = difflib.get_close_matches(name.lower(), plain, n=len(plain) + 1, cutoff=0.5)
+    near.sort(key=lambda entry: sorted(entry) != sorted(name.lower()))  # first, only the order of characters differs
+    return [plain[entry] for entry in near[:count]]
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:

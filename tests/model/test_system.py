@@ -219,6 +219,7 @@ def test_a_long_error_is_shortened_where_it_is_long_and_obeyed_by_no_terminal():
 
 def test_nearest_name():
     assert nearest_name_question("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
+    assert nearest_name_question("run_70", ["run_07", "run_09"]) == "did you mean 'run_07'?"
     assert nearest_name_question("zzz", ["b", "a"]) == ""
     assert nearest_name_question("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
 
