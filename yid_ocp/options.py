@@ -127,7 +127,9 @@ def _words(hint: Any) -> str:
         return f"a list{count}, each {_words(arguments[0])}"
     if mapping_value_type(bare) is not None:
         return f"names, each with {_words(mapping_value_type(bare))}"
-    return "a section"
+    entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
+    needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
+    return "a section" + f", such as {{{needed}}}" * bool(needed)
 
 
 def check_option_bounds(options: Any, where: str) -> None:
