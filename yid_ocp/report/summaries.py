@@ -415,10 +415,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {m}."
     yield SummaryStatement(size, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
+    seen = "Observed: those to which a sensor reacts. " if seconds else ""
+    near = f"one reading within {seconds:.2g} s from equilibrium, or of " if seconds else ""
     yield (
-        "Equations: those of a step that contain the parameter; a table below explains their names. Observed: those to "
-        "which a sensor reacts. [std]: change per unit of the parameter, in stds of noise, of one reading within "
-        f"{seconds:.2g} s from equilibrium, or of all recorded readings."
+        "Equations: those of a step that contain the parameter; a table below explains their names. "
+        f"{seen}[std]: change per unit of the parameter, in stds of noise, of {near}all recorded readings."
     )
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
