@@ -94,7 +94,7 @@ def _diagnose(parser: argparse.ArgumentParser) -> None:
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     _switch(parser, "--what-if", "rank changes of the experiment; takes a few minutes")
-    text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all, if few"
+    text = "95 %% intervals by profile likelihood of: all, none or NAME,NAME (default: all if few, none with --initial)"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
     _switch(parser, "--initial", "analyse the initial values, without solving")
     _switch(parser, "--unknown-start", "also estimate the initial states, regardless of the settings")

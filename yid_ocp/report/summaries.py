@@ -212,13 +212,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryStatement(said, "verdict")
         return
     unsure = ("± [of the value]", "± if start and grasps were unknown", "± if all else were known")
-    rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
+    is_initial = result["at"] == "initial"
+    rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
         spread = (
-            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else f"{s:.0f} times" for s in stds
+            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds
         )
-        interval = _interval_cell(entry, None if stds[0] is None else stds[0] * abs(entry["value"]))
+        interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
@@ -226,15 +227,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
-    cure = "Record other motions (`yid-ocp plan`), or fix one of them (--set parameters.NAME.free=false)"
-    yield f"{cure} at a known value (--set parameters.NAME.initial=VALUE)." if hidden else ""
+    cure = "To find them, record other motions (`yid-ocp plan`). If the value of one is known, fix it instead:"
+    yield f"{cure} --set parameters.NAME.free=false --set parameters.NAME.initial=VALUE." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
-    if not result["profiles"]:
+    if is_initial:
+        yield "The values are initial ones, and ± and verdicts hold near them. For estimates with intervals, omit --initial."
+    elif not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
-    elif result["at"] == "initial":
-        names = ", ".join(result["profiles"])
-        yield f"The values are initial ones, but the interval of {names} belongs to a fit. For both, omit --initial."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]")]
