@@ -70,11 +70,16 @@ class SolverError(YidError):
     """An error that is raised when a method does not support the task, or a solver finds no usable solution."""
 
 
+FAILED_ROLLOUT_ADVICE = (
+    "set model.damping above 0 if it is 0. If that does not help, halve problem.time_step or change "
+    "parameters.NAME.initial"
+)
+
+
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
-    hint = "halve problem.time_step; if that does not help, double model.damping or change parameters.NAME.initial"
     what, allowed = f"the model cannot be simulated: {reason}", "settings for which every time step has a solution"
-    return SolverError(what, where=where, allowed=allowed, hint=hint)
+    return SolverError(what, where=where, allowed=allowed, hint=FAILED_ROLLOUT_ADVICE)
 
 
 _Error = TypeVar("_Error", bound=YidError)

@@ -47,8 +47,8 @@ def test_a_recording_whose_start_is_fitted(carried_out, written, tmp_path):
     assert bend["along"] > 0
     assert result["dependence"]["T1.mass"]["along"] is None
     told = " ".join(done.out.split())
-    assert "in stds of noise, of all recorded readings. " in told
-    assert "The column 'observed equations' is left out: it can be computed only at an equilibrium." in told
+    assert "'Observed'" not in told
+    assert "Which of the equations sensors observe is computed only for recordings that start in equilibrium." in told
     # the step is taken: its equation holds
     row, slope = result["entries"]
     assert row["value"] == pytest.approx(0.0, abs=1e-10)

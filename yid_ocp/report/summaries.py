@@ -9,6 +9,7 @@ from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
     MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
@@ -76,7 +77,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from discretisation_shift_sentences(result)
     if failed:
         said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
-        yield SummaryStatement(said, "verdict")
+        yield SummaryStatement(f"{said} If a simulation failed, {FAILED_ROLLOUT_ADVICE}.", "verdict")
     else:
         texts = *_found_and_lost(free), unused_efforts_sentence(result)
         yield from (SummaryStatement(text, "verdict") for text in texts)
@@ -216,9 +217,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = (
-            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds
-        )
+        spread = ("unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -232,7 +231,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if is_initial:
-        yield "The values are initial ones, and ± and verdicts hold near them. For estimates with intervals, omit --initial."
+        yield "These values are initial ones, with the ± near them. For estimates with intervals, omit --initial."
     elif not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
@@ -412,30 +411,36 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {m}."
+    size = f"The model has {len(roles)} coordinates ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}."
     yield SummaryStatement(size, "verdict")
-    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    seen = "Observed: those to which a sensor reacts. " if seconds else ""
-    near = f"one reading within {seconds:.2g} s from equilibrium, or of " if seconds else ""
-    yield (
-        "Equations: those of a step that contain the parameter; a table below explains their names. "
-        f"{seen}[std]: change per unit of the parameter, in stds of noise, of {near}all recorded readings."
-    )
-    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     values = {n: abs(result["parameters"][n]["value"]) for n in changes}
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
-    most = f"even if all else were known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value"
-    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: {most}."
-    yield SummaryStatement(text if lost else "", "verdict")
-    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"{left} more free parameters are in result.json." if left > 0 else ""
-    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "The column 'observed equations' is left out: it can be computed only at an equilibrium."
+    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
+    text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
+    every = "The readings react to every free parameter. `yid-ocp identifiability` shows which can be found together."
+    yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    yield SummaryStatement(said, "verdict")
+    said += " They do so if gravity tips the object over. While simulations succeed, nothing need be done."
+    yield SummaryStatement(said if radius > 1 + 1e-6 else said.partition(" They")[0], "verdict")
+    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
+    seen = (
+        f" 'Observed' ones move a sensor, and one reading is within {seconds:.2g} s from equilibrium."
+        if seconds
+        else ""
+    )
+    yield (
+        "The table states which equations of one time step contain a parameter (del: motion of a coordinate, p1: its "
+        "momentum after the step), and how much one unit of it changes the readings, in standard deviations of noise "
+        f"(std).{seen}"
+    )
+    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
+    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
+    yield f"{left} more free parameters are in result.json." if left > 0 else ""
+    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
+        yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
@@ -465,7 +470,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
     head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
-    yield *head, "equilibrium [std]", "recordings [std]"
+    yield *head, "change of one reading [std]", "change of all readings [std]"
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
