@@ -70,10 +70,7 @@ class SolverError(YidError):
     """An error that is raised when a method does not support the task, or a solver finds no usable solution."""
 
 
-FAILED_ROLLOUT_ADVICE = (
-    "set model.damping above 0 if it is 0. If that does not help, halve problem.time_step or change "
-    "parameters.NAME.initial"
-)
+FAILED_ROLLOUT_ADVICE = "set model.damping above 0; if it is, halve problem.time_step or change parameters.NAME.initial"
 
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
@@ -143,8 +140,7 @@ def require_known_names(
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
     plain = {entry.lower(): entry for entry in reversed(names)}
     near = difflib.get_close_matches(name.lower(), plain, n=len(plain) + 1, cutoff=0.5)
-    near.sort(key=lambda entry: sorted(entry) != sorted(name.lower()))  # first, only the order of characters differs
-    return [plain[entry] for entry in near[:count]]
+    return [plain[n] for n in sorted(near, key=lambda n: sorted(n) != sorted(name.lower()))[:count]]
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:

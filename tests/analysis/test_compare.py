@@ -431,7 +431,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
-    assert f"The estimates {'have' if kept else 'are without'} the cable's shape memory" in safe.message
+    assert f"The estimates {'include' if kept else 'are without'} shape memory" in safe.message
     assert f"{with_it:.3g} with the memory and {without:.3g} without" in safe.message
 
 

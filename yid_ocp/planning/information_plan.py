@@ -261,7 +261,7 @@ def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    moved_by = f"{1e3 * farthest[best]:.2g} mm if {name} changes by its whole value"
+    moved_by = f"{1e3 * farthest[best]:.2g} mm if {name} changes by {size:.3g}"
     if farthest[best] > _MIN_VISIBLE_MOTION:
         return f"let a camera measure {seen[best].description}, which moves by {moved_by}"
     return "choose another grasp (`yid-ocp identifiability --what-if` ranks some), or set parameters.NAME.free: false"
@@ -284,10 +284,10 @@ def _plan(
         raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
     w, rounds, message = chosen.w, count_with_noun(chosen.n_iterations, "round"), "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
-        way = "lower plan.limits, or set another plan.start_joint_positions"
-        message = f"the result is the best random initial motion. For the search to improve it, {way}"
+        way = "For a better one, lower plan.limits, or set another plan.start_joint_positions"
+        message = f"the search did not improve the best random motion. It may be used with the ± above. {way}"
     elif not chosen.is_converged:
-        message = f"plan.max_iterations ended the search ({rounds}). Raise it or use this motion"
+        message = f"plan.max_iterations ended the search ({rounds}). Use this motion, or raise the limit"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

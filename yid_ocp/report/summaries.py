@@ -329,6 +329,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
+    yield "Expected ± of each parameter (up to 10 % of its value counts as found):"
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -339,12 +340,13 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
     more = f" It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
-    yield f"The search raised the information of the motion by {gain}.{more}"
-    reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"The motion reaches {', and '.join(reached) or 'none of its limits'}."
+    yield f"The search raised the information of the motion by {gain}.{more}" if best["value"] > best["first"] else ""
+    limits: Mapping[str, Sequence[str]] = result["limits_reached"]
+    reached = [f"the {what.partition(' [')[0]} limit of {', '.join(names)}" for what, names in limits.items()]
+    yield f"The motion reaches {' and '.join(reached) or 'none of its limits'}."
     for words in dict.fromkeys(result["unseen"].values()):
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
-        yield f"No sensor observes {names} in any of the motions tried: {words}."
+        yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
