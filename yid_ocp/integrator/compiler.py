@@ -64,8 +64,8 @@ def _compiler_path(wanted: str | None) -> str | None:
         what, where = f"the C compiler '{wanted}' is not found", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
-        why = "CC is none" if wanted == "none" else "no C compiler was found"
-        _LOG.warning("Computations run uncompiled and are about ten times slower, because %s.", why)
+        why = "CC is none" if wanted == "none" else "no C compiler was found (install one, such as gcc)"
+        _LOG.warning("Computations have the same results but are about ten times slower, because %s.", why)
     return path
 
 

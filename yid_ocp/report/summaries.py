@@ -520,7 +520,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     spent = 1e3 * result["fit_seconds"]
     said = result["refused"] or f"{good} of {len(result['frames'])} images are used. One fit took {spent:.0f} ms."
     yield SummaryStatement(said, "verdict")
-    yield from (f"{count_with_noun(n, 'image')} left out, because {reason}" for reason, n in result["dropped"].items())
+    yield from (f"{count_with_noun(n, 'image')} not used, because {why}." for why, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 
@@ -543,7 +543,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate is None:
         return
     if gate["status"] != "done":
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}"
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
         return
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
