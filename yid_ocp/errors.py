@@ -70,9 +70,6 @@ class SolverError(YidError):
     """An error that is raised when a method does not support the task, or a solver finds no usable solution."""
 
 
-FAILED_ROLLOUT_ADVICE = "set model.damping above 0; if it is, halve problem.time_step or change parameters.NAME.initial"
-
-
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
     what, allowed = f"the model cannot be simulated: {reason}", "settings for which every time step has a solution"
@@ -113,6 +110,7 @@ class InsufficientMemoryError(YidError):
     """An error that is raised when the machine has too little memory."""
 
 
+FAILED_ROLLOUT_ADVICE = "set model.damping above 0; if it is, halve problem.time_step or change parameters.NAME.initial"
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
 # names listed in full where none is similar; characters of a list given in full in any case; names listed otherwise
 _MAX_LISTED_NAMES, _MAX_LISTED_CHARACTERS, _N_NEAREST_NAMES = 40, 240, 8

@@ -158,8 +158,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
         return [30 * (a + b) + 5 * s, 30 * (a - b)]
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
-    both = "a change of a by +10 % and b by +10 %"
-    assert said.startswith(f"these recordings cannot distinguish {both} from another initial state. Begin recordings")
+    assert "cannot distinguish a change of a by +10 % and b by +10 % from another initial state. Begin rec" in said
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):

@@ -204,8 +204,7 @@ def choose_fit_with_or_without_shape_memory(
     if other.evaluation is None:
         return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = f"The estimates are without {_MEMORY_WORDS}, because a test of it needs two recordings that start in "
-        words += "motion, and there is only one. For this test, add one under recordings.estimate."
+        words = f"The estimates are without {_MEMORY_WORDS}. To test it, add a second recording that starts in motion."
         return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
     errors = f"{_MEMORY_WORDS}. Recordings, each predicted from the others, have an rms error of {kept:.3g} times the "

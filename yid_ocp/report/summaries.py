@@ -135,7 +135,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{text} Noise alone gives {sizes[2]}, less than half, so there is a gap. {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text} Stated torque noise gives {sizes[2]}, and up to twice this there is no gap.{guess}"
+            yield f"{text} Stated torque noise gives {sizes[2]}. An error up to twice this shows no gap.{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -250,10 +250,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
-    yield SummaryStatement(text, "conclusion")
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)."
+    yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"To find {', '.join(lost)}, start and grasps must be known." if lost else "", "verdict")
+    text = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}." if lost else ""
+    yield SummaryStatement(text, "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -341,8 +342,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     more = f" It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
     yield f"The search raised the information of the motion by {gain}.{more}" if best["value"] > best["first"] else ""
-    limits: Mapping[str, Sequence[str]] = result["limits_reached"]
-    reached = [f"the {what.partition(' [')[0]} limit of {', '.join(names)}" for what, names in limits.items()]
+    reached = [f"the {k.partition(' [')[0]} limit of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     yield f"The motion reaches {' and '.join(reached) or 'none of its limits'}."
     for words in dict.fromkeys(result["unseen"].values()):
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
@@ -552,4 +552,4 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows)
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % below that of `nominal`."
+        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

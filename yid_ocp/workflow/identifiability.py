@@ -124,8 +124,7 @@ def run_identifiability(
             information = judged()
             wanted, names = asked.interval_parameters, information.parameter_names
             if isinstance(wanted, str):
-                is_small = solution is not None and is_small_enough_for_profiles(problem)
-                wanted = names if wanted == "all" or is_small else ()
+                wanted = names if wanted == "all" or (solution and is_small_enough_for_profiles(problem)) else ()
             if tasks is not None and wanted and set(wanted) <= set(names):
                 progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
                 information = tasks.with_profile_likelihoods(information, wanted)
