@@ -268,7 +268,8 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
-        text.append(_listed("Changed since the earlier runs, by more than the ±: ", moved) or same * (not rivals))
+        end = ". If nothing was altered on purpose, find the cause before you use the values."
+        text.append(_listed("Changed since the earlier runs, by more than the ±: ", moved, end) or same * (not rivals))
         text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
         p = since.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."

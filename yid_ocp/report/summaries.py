@@ -168,7 +168,8 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
-    yield from (f"The held-out recording '{name}' could not be predicted, because {why}." for name, why in failed)
+    advice = f"If its motion grew, {FAILED_ROLLOUT_ADVICE}."
+    yield from (f"Held-out recording '{name}' could not be predicted, because {why}. {advice}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
     yield f"For comparison, the last column has the rms errors of guesses: {legend}." if legend else ""
 
@@ -300,7 +301,8 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
-    yield SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
+    is_usable = result["status"] == "failed" and result["goal"] == "information"
+    yield SummaryStatement(f"{'not finished' if is_usable else result['status']}: {result['message']}", "conclusion")
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -498,7 +500,8 @@ def _row_names_text(names: Sequence[str]) -> str:
 @register_summary("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
-        yield SummaryStatement(f"The simulation failed: {result['message']}.", "verdict")
+        said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
+        yield SummaryStatement(said, "verdict")
     else:
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group", "samples"), *rows], "Recorded", is_key_table=True)
