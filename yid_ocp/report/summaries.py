@@ -427,7 +427,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    said += " They do so if gravity tips the object over. While simulations succeed, nothing need be done."
+    said += " They show an instability of the motion there. While simulations succeed, nothing need be done."
     yield SummaryStatement(said if radius > 1 + 1e-6 else said.partition(" They")[0], "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     seen = (
@@ -548,7 +548,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate["status"] != "done":
         yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
         return
-    rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
+    rows = [("replayed channel", "without estimates", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
