@@ -177,11 +177,11 @@ def _causes(result: DiagnosisResult) -> list[str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     unsure = " and ".join(sizes := result.undetermined_sizes(limits))
-    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} ± or more from the one without effect"
+    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} std or more from that without effect"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
-    more = f" Only {', '.join(kinds)} was tried. To try more, leave out diagnosis.candidates, if it is set."
+    more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set."
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": f"{none} no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}",

@@ -51,7 +51,7 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (slower)."
+_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
 
 
 @functools.cache
