@@ -521,8 +521,8 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} images are used. One fit took {spent:.0f} ms."
-    yield SummaryStatement(said, "verdict")
+    used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
+    yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
     yield from (f"{count_with_noun(n, 'image')} not used, because {why}." for why, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
