@@ -168,8 +168,8 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
-    advice = f"If its motion grew, {FAILED_ROLLOUT_ADVICE}."
-    yield from (f"Held-out recording '{name}' could not be predicted, because {why}. {advice}" for name, why in failed)
+    do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
+    yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
     yield f"For comparison, the last column has the rms errors of guesses: {legend}." if legend else ""
 
