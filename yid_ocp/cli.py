@@ -94,7 +94,7 @@ def _diagnose(parser: argparse.ArgumentParser) -> None:
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     _switch(parser, "--what-if", "rank changes of the experiment; takes a few minutes")
-    text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all, if few"
+    text = "95 %% intervals by profile likelihood of: all, none or NAME,NAME (default: all if few, none with --initial)"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
     _switch(parser, "--initial", "analyse the initial values, without solving")
     _switch(parser, "--unknown-start", "also estimate the initial states, regardless of the settings")
@@ -150,8 +150,7 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
 
 def _inspect(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
-    text = "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a "
-    text += "parameter enters"
+    text = "equation to print; with COLUMN, its derivative ('del[T1_0_x], q1[T1_0_x]'); or a parameter, to see its use"
     _repeated(parser, "--entry", "ROW[, COLUMN]", text, "entries")
     parser.add_argument("--export", metavar="DIR", help="folder for the equations as CasADi functions and C")
 
@@ -205,8 +204,7 @@ def _init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
     _switch(parser, "--replace", "overwrite existing files")
-    text = "held object, such as cable, beam, tree or foam_y; an unknown word lists all; "
-    text += "without it the arm alone, with a payload"
+    text = "held object: cable, beam, tree, foam_y or others (any word lists them); without it, an arm with a payload"
     parser.add_argument("--object", metavar="KIND", help=text)
     for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):
         text = f"{name} of the object, or of each equal branch [{unit}]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
@@ -37,7 +38,8 @@ class YidError(Exception):
         room, parts = _MAX_MESSAGE_LENGTH, len(shown)
         for key, text in sorted(shown.items(), key=lambda item: len(item[1])):  # short ones leave room to long ones
             half = (room // parts - 5) // 2
-            shown[key] = text if len(text) <= room // parts else f"{text[:half]} ... {text[-half:]}"
+            begin, end = re.sub(r" \S{,40}$", "", text[:half]), re.sub(r"^\S{,40} ", "", text[-half:])  # whole words
+            shown[key] = text if len(text) <= room // parts else f"{begin} ... {end}"
             room, parts = room - len(shown[key]), parts - 1
         return shown
 
@@ -70,9 +72,8 @@ class SolverError(YidError):
 
 def failed_rollout_error(reason: str, where: str = "parameter values and initial states") -> SolverError:
     """Create the `SolverError` for a model that cannot be simulated at `where`. `reason` completes the message."""
-    hint = "halve problem.time_step; if that does not help, double model.damping or change parameters.NAME.initial"
     what, allowed = f"the model cannot be simulated: {reason}", "settings for which every time step has a solution"
-    return SolverError(what, where=where, allowed=allowed, hint=hint)
+    return SolverError(what, where=where, allowed=allowed, hint=FAILED_ROLLOUT_ADVICE)
 
 
 _Error = TypeVar("_Error", bound=YidError)
@@ -109,6 +110,7 @@ class InsufficientMemoryError(YidError):
     """An error that is raised when the machine has too little memory."""
 
 
+FAILED_ROLLOUT_ADVICE = "set model.damping above 0; if it is, halve problem.time_step or change parameters.NAME.initial"
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
 # names listed in full where none is similar; characters of a list given in full in any case; names listed otherwise
 _MAX_LISTED_NAMES, _MAX_LISTED_CHARACTERS, _N_NEAREST_NAMES = 40, 240, 8
@@ -135,7 +137,8 @@ def require_known_names(
 
 def _close(name: str, names: Sequence[str], count: int) -> list[str]:
     plain = {entry.lower(): entry for entry in reversed(names)}
-    return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
+    near = difflib.get_close_matches(name.lower(), plain, n=len(plain) + 1, cutoff=0.5)
+    return [plain[n] for n in sorted(near, key=lambda n: sorted(n) != sorted(name.lower()))[:count]]
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:

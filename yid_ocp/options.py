@@ -124,10 +124,12 @@ def _words(hint: Any) -> str:
         return ", ".join(map(str, arguments))
     if get_origin(bare) is tuple:
         count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
-        return f"a list{count}, each {_words(arguments[0])}"
+        return f"a list{count}, each {_words(arguments[0])}".replace(", each a section", " of sections", 1)
     if mapping_value_type(bare) is not None:
         return f"names, each with {_words(mapping_value_type(bare))}"
-    return "a section"
+    entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
+    needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
+    return "a section" + f", such as {{{needed}}}" * bool(needed)
 
 
 def check_option_bounds(options: Any, where: str) -> None:
@@ -141,8 +143,10 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 
 def default_value_hint(key: str, default: Any) -> str:
-    """Return the advice to set an option to an allowed value, or to its default if it has one."""
-    return f"set {key} to an allowed value" + f", such as {default}" * isinstance(default, (int, float, str))
+    """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
+    if isinstance(default, (int, float, str)):
+        return f"set {key} to an allowed value, such as {default}"
+    return f"write {key} in the form that is allowed" + ", or leave it out" * (default is not MISSING)
 
 
 def _within(hint: Any, value: Any) -> bool:

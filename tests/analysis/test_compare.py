@@ -407,7 +407,7 @@ def test_a_single_recording_in_motion_bears_nothing_out(solved):
     safe = choose_fit_with_or_without_shape_memory(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
     assert safe.problem is solved.problems[0]
     assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
-    assert "needs two recordings that start in motion" in safe.message
+    assert "add a second recording that starts in motion" in safe.message
 
 
 @pytest.mark.parametrize(
@@ -431,14 +431,14 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
-    assert f"The estimates {'have' if kept else 'are without'} the cable's shape memory" in safe.message
-    assert f"{with_it:.3g} with the memory and {without:.3g} without" in safe.message
+    assert f"The estimates {'include' if kept else 'are without'} shape memory" in safe.message
+    assert f"{with_it:.3g} times the noise with this memory and {without:.3g} times without" in safe.message
 
 
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert "inf with the memory and" in choose_fit_with_or_without_shape_memory(problem, None, found).message
+    assert "of inf times the noise" in choose_fit_with_or_without_shape_memory(problem, None, found).message
     solved.ok = False
     assert choose_fit_with_or_without_shape_memory(problem, None, found).solution is found
 

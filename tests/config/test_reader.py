@@ -192,6 +192,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
         ("problem.time_step=fast", ["a number"]),
         ("parameters.shoulder.stiffness.initail=3", ["did you mean 'parameters.shoulder.stiffness.initial'?"]),
         ("problem.time_step.deeper=1", ["'problem.time_step' has a value, and no key 'deeper' below it"]),
+        ("model.effects={kind: law}", ["a list of sections, such as {kind: KIND, location: ", "entry: [{"]),
         ("problem.time_step=[1", ["not valid YAML"]),
         ("solver={name:single_shooting}", ["put a space after the colon, as in {name: single_shooting}"]),
     ],

@@ -257,7 +257,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
     assert damping.std_planned == damping.std_combined == np.inf
     assert found.parameter_precisions["elbow.stiffness"].std_planned < 1.0
     with refused_with(
-        ConfigError, ("information about shoulder.damping", "a parameter that changes readings", "standard deviations")
+        ConfigError, ("determines shoulder.damping", "a parameter that changes readings", "readings by 0 std")
     ):
         plan_informative_motion(blind, replace(OPTIONS, parameters_to_identify=("shoulder.damping",)))
     options = SimpleNamespace(clamp_pose_point_names="a")

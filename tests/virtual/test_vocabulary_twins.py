@@ -287,7 +287,7 @@ def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_lim
     values = VALUES | {"pan.servo_derivative": 0.3}
     pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")
     assert pan.biasprm[1:3] == pytest.approx((-40.0, -0.3))
-    with pytest.raises(ModelError, match="MuJoCo lacks the servo's dead band of 'lift'"):
+    with pytest.raises(ModelError, match="servo 'lift' has a dead band, MuJoCo none"):
         mujoco_xml(system, values | {"lift.servo_dead_band": 0.01})
     limited = system.with_effects([make_effect("current_limit", "pan", system, {"limit": 1.5})])
     with pytest.raises(ModelError, match="cannot express what the effect changes: dead band and current limit"):

@@ -51,7 +51,7 @@ def test_a_wrong_length_is_said_and_its_point_is_not_written(track, factor, valu
     assert ratio(found, "T3.length") == pytest.approx(factor, abs=0.02)
     [message] = found.dimensions.messages
     assert "T3.length seems to be wrong" in message
-    assert "the model says 737 mm" in message
+    assert "the model has 737 mm" in message
     assert "estimated_dimensions: [length]" in message
     # the interval holds the truth
     i = found.dimensions.names.index("T3.length")

@@ -167,6 +167,7 @@ def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | No
 
 
 _MEMORY_SUFFIX = ".memory"
+_MEMORY_WORDS = "shape memory (the rest shape of the cable keeps a part of its first shape)"
 _MAX_REST_SPEED = 0.01  # a recording whose points move more slowly at its start starts at rest [m/s]
 _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
@@ -203,15 +204,14 @@ def choose_fit_with_or_without_shape_memory(
     if other.evaluation is None:
         return FitWithOrWithoutShapeMemory(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
-        words = "The estimates are without the cable's shape memory, because a test of the memory needs two recordings "
-        words += "that start in motion, and there is only one. For this test, add one under recordings.estimate."
+        words = f"The estimates are without {_MEMORY_WORDS}. To test it, add a second recording that starts in motion."
         return FitWithOrWithoutShapeMemory(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    told = "Recordings that start in motion, each predicted from the others, have an rms error of"
-    errors = f"{told} {kept:.3g} with the memory and {dropped:.3g} without (in standard deviations of the noise)."
+    errors = f"{_MEMORY_WORDS}. Recordings, each predicted from the others, have an rms error of {kept:.3g} times the "
+    errors += f"noise with this memory and {dropped:.3g} times without."
     if kept < dropped:
-        return FitWithOrWithoutShapeMemory(problem, solution, f"The estimates have the cable's shape memory. {errors}")
-    return FitWithOrWithoutShapeMemory(without, other, f"The estimates are without the cable's shape memory. {errors}")
+        return FitWithOrWithoutShapeMemory(problem, solution, f"The estimates include {errors}")
+    return FitWithOrWithoutShapeMemory(without, other, f"The estimates are without {errors}")
 
 
 def problem_without_shape_memory(problem: EstimationProblem) -> EstimationProblem:

@@ -428,9 +428,8 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
 def _change_words(parts: Sequence[_Component]) -> str:
     if len(parts) == 1:
         return parts[0].name
-    changes = [f"{part.coefficient / parts[0].coefficient:.2g}" for part in parts]
-    ratio = " : ".join([*changes[:_MAX_LISTED_NAMES], "..."][: len(parts)])
-    return f"a relative change of {_joined([part.name for part in parts])} in the ratio {ratio}"
+    changes = [f"{part.name} by {10 * part.coefficient / parts[0].coefficient:+.2g} %" for part in parts]
+    return f"a change of {_joined(changes)}"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

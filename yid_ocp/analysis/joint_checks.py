@@ -394,8 +394,7 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
         if not 1 / factor < scale < factor:
-            words = f"efforts are {scale:.2g} times what gravity and motion require "
-            words += f"(1/{factor:g} to {factor:g} times is tolerated)"
+            words = f"efforts are {scale:.2g} times the required ones (1/{factor:g} to {factor:g} times is tolerated)"
             advice = f"divide the efforts in the file by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
             common = 1.0  # said; each joint is compared with the others

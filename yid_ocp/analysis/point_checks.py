@@ -193,14 +193,14 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
     if len(a) < 4:
         return
     shift = b.mean(axis=0) - a.mean(axis=0)
-    words = "shifted by ({:.3g}, {:.3g}, {:.3g}) m".format(*shift)
-    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame, {words}", _rms(a + shift - b))
+    words, advice = "({:.3g}, {:.3g}, {:.3g}) m".format(*shift), "to the positions, to have them in the robot's frame"
+    yield _Change("point_frame", f"if shifted by {words}", f"add {words} {advice}", _rms(a + shift - b))
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
     left = _rms((a - a.mean(axis=0)) @ turn + b.mean(axis=0) - b)
     angle = math.degrees(math.acos(float(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    words = f"turned by {angle:.3g} degrees and shifted"
-    yield _Change("point_frame", f"if {words}", f"give positions in the robot's frame, {words}", left)
+    words, advice = f"if turned by {angle:.3g} degrees and shifted", "transform the positions to the robot's frame"
+    yield _Change("point_frame", words, advice, left)
 
 
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:

@@ -257,8 +257,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     for j in wrong:
         size, cause = abs(ratio[j]), "angle_scale"
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
-        what = f"the angle of {names[j]} changes {ratio[j]:.3g} times as fast as its recorded velocity states"
-        what += f" ({_RATES_TOLERATED})"
+        what = f"{names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity states ({_RATES_TOLERATED})"
         advice = f"divide the angle of {names[j]} in the file by {ratio[j]:.3g}, or correct its velocity"
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
             cause, evidence, advice = "angle_sign", LIMIT_VIOLATION_RATIO_CAP, f"multiply the angle of {names[j]} by -1"

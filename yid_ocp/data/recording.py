@@ -421,8 +421,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
             raise DataError(what, where=place, allowed="finite numbers", hint=hint)
         unit, size = JOINT_CHANNEL_UNITS[channel], np.nan_to_num(np.abs(value))
         row, column = divmod(int(size.argmax()), len(joints.names))
-        what = f"channel '{channel}' reaches {size.max():g} {unit} "
-        what += f"(joint '{joints.names[column]}', t = {joints.t[row]:g} s)"
+        what = f"'{channel}' reaches {size.max():g} {unit} (joint '{joints.names[column]}', {joints.t[row]:g} s)"
         hint = f"check the unit of the channel; import the original data again with --units {channel}=UNIT"
         if unit == "rad":
             hint = f"if the unit is degrees, import the original data again with --units {channel}=deg"

@@ -169,8 +169,8 @@ def _read_group(
             what, hint = f"the group has an unknown {noun}, '{name}'", f"rename or delete the {noun} '{name}'"
             raise DataError(what, where=where, **unknown_name_error_arguments(name, known, hint))
         for name in sorted(wanted - found):
-            what, hint = f"the {noun} '{name}' is missing", f"add the {noun} '{name}', or leave the group out"
-            raise DataError(what, where=where, allowed=f"groups with {', '.join(sorted(wanted))}", hint=hint)
+            what, hint = f"the {noun} '{name}' is missing in {group.name}", "add it, or leave the group out"
+            raise DataError(what, where=where, allowed=f"a group with {noun}s {', '.join(sorted(wanted))}", hint=hint)
     what, is_twice = "`std` is both a dataset and an attribute", "std" in group and "std" in group.attrs
     raise_data_error_unless(not is_twice, what, where, "a dataset or an attribute", "delete one of the two `std`")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}

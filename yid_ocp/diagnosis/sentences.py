@@ -22,6 +22,7 @@ from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, va
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_CHANGES = 5  # number of named parameters, the largest changes first
+_FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
@@ -177,13 +178,14 @@ def _causes(result: DiagnosisResult) -> list[str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     unsure = " and ".join(sizes := result.undetermined_sizes(limits))
-    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} ± or more from the one without effect"
+    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} std or more from that without effect"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
-    none = "No cause is named, because"
+    none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
+    more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set."
     reasons = {
         "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
-        "none": f"{none} none of the effects that were tried explains the error well enough.",
+        "none": f"{none} no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}",
         "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
         "stand_in": f"{none} {size}{apart}. {either}.",
     }
@@ -270,7 +272,8 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
-        text.append(_listed("Changed since the earlier runs, by more than the ±: ", moved) or same * (not rivals))
+        end = ". If nothing was altered on purpose, find the cause before you use the values."
+        text.append(_listed("Changed since the earlier runs, by more than the ±: ", moved, end) or same * (not rivals))
         text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
         p = since.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."

@@ -327,9 +327,7 @@ class _ServoDelay(_ServoChange):
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
     required_excitation = "the rate of its readings"
-    declared_parameters = (
-        ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "delay of commands beyond servo_delay"),
-    )
+    declared_parameters = (ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "delay beyond servo_delay"),)
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)

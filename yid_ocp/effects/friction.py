@@ -127,9 +127,7 @@ class _JointLoadFriction(_JointFriction):
 
     equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"
     candidate_locations = base.servo_joint_names  # recorded torques leave no room for what a gear takes of them
-    declared_parameters = (
-        ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per torque through the gear"),
-    )
+    declared_parameters = (ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per gear torque"),)
 
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, index = state.system, state.system.mechanism.joint_index(self.location)

@@ -51,7 +51,7 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (slower)."
+_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
 
 
 @functools.cache
@@ -64,8 +64,8 @@ def _compiler_path(wanted: str | None) -> str | None:
         what, where = f"the C compiler '{wanted}' is not found", "the environment variable CC"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if path is None:
-        why = "CC is none" if wanted == "none" else "no C compiler was found"
-        _LOG.warning("Computations run uncompiled and are about ten times slower, because %s.", why)
+        why = "CC is none" if wanted == "none" else "no C compiler was found (install one, such as gcc)"
+        _LOG.warning("Computations have the same results but are about ten times slower, because %s.", why)
     return path
 
 

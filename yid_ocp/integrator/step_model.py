@@ -79,19 +79,15 @@ class NewtonStatusCode(IntEnum):
 _STATUS_MESSAGES = {
     NewtonStatusCode.OK: "converged",
     NewtonStatusCode.NOT_CONVERGED: "Newton's method found no solution of its equations",
-    NewtonStatusCode.SINGULAR: "the equations of the step are singular; look in model.grasp for two grasps that hold "
-    "the same point, and in the robot file for a joint that moves no mass",
-    NewtonStatusCode.NOT_FINITE: "the state is no longer finite, because the simulated motion is unstable; "
-    "add damping or, for driven arms, a tracking filter",
+    NewtonStatusCode.SINGULAR: "the equations of the step are singular, as with two grasps that hold the same point, "
+    "or with a joint that moves no mass",
+    NewtonStatusCode.NOT_FINITE: "the state is no longer finite, because the simulated motion is unstable",
     NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 _LONG_ROLLOUT_STEPS = 100
 """Number of steps after which a failure is attributed to the integration method, not to the initial state."""
-_INSTABILITY_HINT = (
-    "set model.damping above 0 if it is 0, or halve problem.time_step: the midpoint rule has no numerical damping, so "
-    "the fastest vibrations of an undamped model can grow over some hundred steps"
-)
+_INSTABILITY_CAUSE = "usually because a fast vibration grows: the midpoint rule has no numerical damping"
 
 
 @dataclass(frozen=True)
@@ -116,14 +112,13 @@ class RolloutNewtonSummary:
 
     @property
     def message(self) -> str:
-        """A sentence that explains the status, with step, last correction and remedy."""
+        """A sentence that explains the status, with step and usual cause. It has no advice, which errors add."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
         step, is_open = self.completed_steps, self.code == NewtonStatusCode.NOT_CONVERGED
-        size = f" (last correction {self.last_correction:.2g} rad or m)" * is_open
-        said = f"at step {step}, {_STATUS_MESSAGES[self.code]}{size}"
+        said = f"at step {step}, {_STATUS_MESSAGES[self.code]}"
         unstable = step >= _LONG_ROLLOUT_STEPS and (is_open or self.code == NewtonStatusCode.NOT_FINITE)
-        return f"{said}; {_INSTABILITY_HINT}" if unstable else said
+        return f"{said}, {_INSTABILITY_CAUSE}" if unstable else said
 
 
 @dataclass(frozen=True)

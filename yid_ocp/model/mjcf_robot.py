@@ -186,18 +186,18 @@ def _left_out(model: Any) -> Iterator[str]:
     """Sentences on elements of the file that the mechanism omits."""
     taken = len(_followed_joints(model)) + len(_welded_free_bodies(model))
     others_than_servos = [i for i in range(model.nu) if not _is_position_actuator(model, i)]
-    motors = sum(_is_motor(model, i) for i in others_than_servos)
+    motors, lacking = sum(_is_motor(model, i) for i in others_than_servos), "Predicted efforts lack their forces"
     others = {
         "motors": (motors, "Efforts count as torques at the joint, and the motors' limits are kept"),
-        "actuators other than motors and position servos": (len(others_than_servos) - motors, ""),
+        "actuators other than motors and position servos": (len(others_than_servos) - motors, lacking),
         "equalities": (model.neq - taken, "For a weld or connect that closes a loop, set model.grasp"),
         "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "To have them, set model.joint_springs"),
-        "tendons": (model.ntendon, ""),
-        "bodies of free objects": (len(_bodies_of_free_objects(model)), ""),
-        "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), ""),
+        "tendons": (model.ntendon, lacking),
+        "bodies of free objects": (len(_bodies_of_free_objects(model)), "Contacts are not modelled"),
+        "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), lacking),
     }
     for noun, (count, remedy) in ((noun, own) for noun, own in others.items() if own[0]):
-        yield f"the model leaves out {noun} ({count} in the file)" + (f". {remedy}" if remedy else "")
+        yield f"the model leaves out {noun} ({count} in the file). {remedy}"
 
 
 def _body_name(model: Any, i: int) -> str:

@@ -235,8 +235,7 @@ def _check_seen(
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
         worst = max(unseen[name] for name in lost)
-        what = f"no motion gives information about {', '.join(lost)}: a change by the whole value of a parameter "
-        what += f"changes all readings together by at most {worst:.1g} standard deviations"
+        what = f"no motion determines {', '.join(lost)}: doubling one changes all readings by {worst:.1g} std at most"
         hint = "; ".join(dict.fromkeys(_would_see(experiment, name, _random(experiment, 0)) for name in lost))
         where = "plan.parameters_to_identify"
         raise ConfigError(what, where=where, allowed="a parameter that changes readings", hint=hint)
@@ -257,11 +256,11 @@ def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
         return f"add another sensor to observe {name}"
     frames = FramePositionEvaluator(wide.system, [sight.name for sight in seen])
     by_q = frames.positions_and_jacobian(rolled.state[:, :n], mover.theta)[1]
-    size = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0
+    size, unit = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0, wide.system.parameters[name].unit
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    moved_by = f"{1e3 * farthest[best]:.2g} mm if {name} changes by its whole value"
+    moved_by = f"{1e3 * farthest[best]:.2g} mm if {name} changes by {size:.3g} {unit}"
     if farthest[best] > _MIN_VISIBLE_MOTION:
         return f"let a camera measure {seen[best].description}, which moves by {moved_by}"
     return "choose another grasp (`yid-ocp identifiability --what-if` ranks some), or set parameters.NAME.free: false"
@@ -284,10 +283,10 @@ def _plan(
         raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
     w, rounds, message = chosen.w, count_with_noun(chosen.n_iterations, "round"), "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
-        way = "lower plan.limits, or set another plan.start_joint_positions"
-        message = f"the result is the best random initial motion. For the search to improve it, {way}"
+        way = "For a better one, lower plan.limits, or set another plan.start_joint_positions"
+        message = f"the search did not improve the best random motion. It may be used with the ± above. {way}"
     elif not chosen.is_converged:
-        message = f"plan.max_iterations ended the search ({rounds}). Raise it or use this motion"
+        message = f"plan.max_iterations ended the search ({rounds}). Use this motion, or raise the limit"
     precisions, unidentifiable = _parameters(experiment, w)
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
     return InformativeMotionPlan(

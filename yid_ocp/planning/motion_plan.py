@@ -102,7 +102,7 @@ def plan_motion_to_target(
         rows = PlanResidualAndLimitFunctions(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
 
-    progress.begin_stage(f"searching the motion in {options.duration:g} s")
+    progress.begin_stage(f"searching for a motion that lasts {options.duration:g} s")
     found = attempt(options.duration)
     if options.minimize_duration:
         found = _shortest(found, options, step.time_step, attempt, progress)
@@ -285,12 +285,12 @@ def _shortest(
         return found
     low, high = 0, round(options.duration / h)
     finest = max(1, round(0.02 / h))
-    progress.begin_stage("searching the shortest motion")
+    progress.begin_stage("searching for the shortest motion")
     for done in itertools.count():
         if high - low <= finest:
             break
         middle, left = (low + high) // 2, math.ceil(math.log2((high - low) / finest))
-        progress.report_parts_done(done, done + left, f"a motion in {middle * h:g} s")
+        progress.report_parts_done(done, done + left, f"a motion that lasts {middle * h:g} s")
         tried = attempt(middle * h)
         if good(tried):
             found, high = tried, middle

@@ -508,14 +508,12 @@ def episode_with_equilibrium_guess(predictor: EpisodePredictor, episode: Episode
     shapes = [least.copy()]
     shapes[0][elastic] *= -1  # bent the other way, as a foam tube may hang on either side of its grippers
     with contextlib.suppress(DataError):
-        fit, at = (
-            predictor.model_functions.initial_state_fitter.fit_initial_state_to_points,
-            episode.initial_known_coordinates,
-        )
+        at, fitter = episode.initial_known_coordinates, predictor.model_functions.initial_state_fitter
         seen = [s for s in early.measurements if s.node[0] * episode.grid.time_step <= _MAX_RESTING_TIME]
         seen = [replace(s, node=np.zeros(1, np.int64), fraction=np.zeros(1)) for s in seen]
         # an equilibrium near this configuration has the details
-        shapes.append(fit(at, seen, own, _MAX_RESTING_TIME, episode.prescribed_path, roughly=True).state[:n])
+        begin = at, seen, own, _MAX_RESTING_TIME, episode.prescribed_path
+        shapes.append(fitter.fit_initial_state_to_points(*begin, roughly=True).state[:n])
     others = [predictor.initial_state_and_derivative(episode, own, offset, (), shape).state[:n] for shape in shapes]
     errors = [_first_points_error(predictor, replace(early, equilibrium_guess=q), theta) for q in others]
     errors.append(_MAX_REMAINING_ERROR_FRACTION * error)

@@ -158,7 +158,7 @@ def _recorded_input_errors(
         if not joint_sensors.is_noise_std_stated(joints, group, choice):
             words = "%s: the noise of %s is neither recorded nor configured, so %.2g to %.2g %s is estimated from its "
             told = recording.name, group, level.min(), level.max(), CHANNEL_KINDS[group].unit, group
-            log.warning(words + "fastest changes. For another value, set sensors.%s.std", *told)
+            log.warning(words + "fastest changes. If you know a better value, set sensors.%s.std", *told)
     if encoders:
         columns = [joints.names.index(name) for name in driven]
         std = np.maximum(std, _MIN_TORQUE_ERROR_FRACTION * np.maximum(np.std(joints.effort[:, columns], axis=0), 1e-3))

@@ -148,9 +148,9 @@ def _courses(
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
             return [_held(np.zeros(len(t)), edges)] * len(driven)  # motors are off
         if joints.position_command is None:
-            what = "the servos of the model follow commanded positions, but the recording has none"
+            what = "model.arms.mode is servo, so the joints follow commanded positions, but the recording has none"
             allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
-            hint = "import the commands (for a bag: --command-topic TOPIC), or set model.arms.mode: prescribed"
+            hint = "import commands (bag: --command-topic TOPIC), or let measured angles move the arm: mode: prescribed"
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
         rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
@@ -288,8 +288,8 @@ def _clamp_course(
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
         names, at = (clamp.origin_point_name, clamp.z_axis_point_name), grid.node_times[int(np.argmin(length))]
-        what = f"points '{names[0]}' and '{names[1]}', which give a clamp's direction, coincide at {at:.4g} s"
-        allowed, hint = "two points at least 1e-6 m apart", "choose other points for this clamp under model.object"
+        what = f"{clamp.clamp_name} has no direction: its points '{names[0]}' and '{names[1]}' coincide at {at:.4g} s"
+        allowed, hint = "two points at least 1e-6 m apart", "correct the points, or choose others under model.object"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     d = direction / length
     about_y = np.arcsin(np.clip(d[:, 0], -1, 1))

@@ -251,7 +251,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         drifted, wrong = _drifted_and_distrusted(alike)
         changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
         said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}, because the other runs agree much better alone."] if wrong else []
+        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
@@ -394,7 +394,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
         yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}, because the other runs agree much better alone."
+        yield f"Do not trust {' and '.join(wrong)}, because the others agree much better without it."
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."

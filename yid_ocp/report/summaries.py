@@ -9,6 +9,7 @@ from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
     MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
@@ -77,7 +78,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from discretisation_shift_sentences(result)
     if failed:
         said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
-        yield SummaryStatement(said, "verdict")
+        yield SummaryStatement(f"{said} If a simulation failed, {FAILED_ROLLOUT_ADVICE}.", "verdict")
     else:
         texts = *_found_and_lost(free), unused_efforts_sentence(result)
         yield from (SummaryStatement(text, "verdict") for text in texts)
@@ -134,7 +135,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{text} Noise alone gives {sizes[2]}, less than half, so there is a gap. {advice}{guess}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text} Stated torque noise gives {sizes[2]}, and up to twice this there is no gap.{guess}"
+            yield f"{text} Stated torque noise gives {sizes[2]}. An error up to twice this shows no gap.{guess}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -167,7 +168,8 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
-    yield from (f"The held-out recording '{name}' could not be predicted, because {why}." for name, why in failed)
+    do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
+    yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
     yield f"For comparison, the last column has the rms errors of guesses: {legend}." if legend else ""
 
@@ -212,13 +214,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryStatement(said, "verdict")
         return
     unsure = ("± [of the value]", "± if start and grasps were unknown", "± if all else were known")
-    rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]
+    is_initial = result["at"] == "initial"
+    rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = (
-            "unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else f"{s:.0f} times" for s in stds
-        )
-        interval = _interval_cell(entry, None if stds[0] is None else stds[0] * abs(entry["value"]))
+        spread = ("unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
+        interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
@@ -226,15 +227,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
-    cure = "Record other motions (`yid-ocp plan`), or fix one of them (--set parameters.NAME.free=false)"
-    yield f"{cure} at a known value (--set parameters.NAME.initial=VALUE)." if hidden else ""
+    cure = "To find them, record other motions (`yid-ocp plan`). If the value of one is known, fix it instead:"
+    yield f"{cure} --set parameters.NAME.free=false --set parameters.NAME.initial=VALUE." if hidden else ""
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
-    if not result["profiles"]:
+    if is_initial:
+        yield "These values are initial ones, with the ± near them. For estimates with intervals, omit --initial."
+    elif not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
-    elif result["at"] == "initial":
-        names = ", ".join(result["profiles"])
-        yield f"The values are initial ones, but the interval of {names} belongs to a fit. For both, omit --initial."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         rows = [("change", "found", "gain [nat]")]
@@ -251,10 +251,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings."
-    yield SummaryStatement(text, "conclusion")
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)."
+    yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    yield SummaryStatement(f"To find {', '.join(lost)}, start and grasps must be known." if lost else "", "verdict")
+    text = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}." if lost else ""
+    yield SummaryStatement(text, "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -300,7 +301,8 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
-    yield SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
+    is_usable = result["status"] == "failed" and result["goal"] == "information"
+    yield SummaryStatement(f"{'not finished' if is_usable else result['status']}: {result['message']}", "conclusion")
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -330,6 +332,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
+    yield "Expected ± of each parameter (up to 10 % of its value counts as found):"
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -340,12 +343,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
     more = f" It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
     gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
-    yield f"The search raised the information of the motion by {gain}.{more}"
-    reached = [f"the limit of {what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
-    yield f"The motion reaches {', and '.join(reached) or 'none of its limits'}."
+    yield f"The search raised the information of the motion by {gain}.{more}" if best["value"] > best["first"] else ""
+    reached = [f"the {k.partition(' [')[0]} limit of {', '.join(n)}" for k, n in result["limits_reached"].items()]
+    yield f"The motion reaches {' and '.join(reached) or 'none of its limits'}."
     for words in dict.fromkeys(result["unseen"].values()):
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
-        yield f"No sensor observes {names} in any of the motions tried: {words}."
+        yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
@@ -418,29 +421,36 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    size = f"Coordinates: {len(roles)} ({', '.join(counts)}). Constraints of the grasps: {m}."
+    size = f"The model has {len(roles)} coordinates ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}."
     yield SummaryStatement(size, "verdict")
-    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    yield (
-        "Equations: those of a step that contain the parameter; a table below explains their names. Observed: those to "
-        "which a sensor reacts. [std]: change per unit of the parameter, in stds of noise, of one reading within "
-        f"{seconds:.2g} s from equilibrium, or of all recorded readings."
-    )
-    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     values = {n: abs(result["parameters"][n]["value"]) for n in changes}
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
-    most = f"even if all else were known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value"
-    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: {most}."
-    yield SummaryStatement(text if lost else "", "verdict")
-    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"{left} more free parameters are in result.json." if left > 0 else ""
-    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "The column 'observed equations' is left out: it can be computed only at an equilibrium."
+    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
+    text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
+    every = "The readings react to every free parameter. `yid-ocp identifiability` shows which can be found together."
+    yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    yield SummaryStatement(said, "verdict")
+    said += " They show an instability of the motion there. While simulations succeed, nothing need be done."
+    yield SummaryStatement(said if radius > 1 + 1e-6 else said.partition(" They")[0], "verdict")
+    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
+    seen = (
+        f" 'Observed' ones move a sensor, and one reading is within {seconds:.2g} s from equilibrium."
+        if seconds
+        else ""
+    )
+    yield (
+        "The table states which equations of one time step contain a parameter (del: motion of a coordinate, p1: its "
+        "momentum after the step), and how much one unit of it changes the readings, in standard deviations of noise "
+        f"(std).{seen}"
+    )
+    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
+    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
+    yield f"{left} more free parameters are in result.json." if left > 0 else ""
+    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
+        yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
     for name, entry in result["parameters"].items():
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
@@ -470,7 +480,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
     head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
-    yield *head, "equilibrium [std]", "recordings [std]"
+    yield *head, "change of one reading [std]", "change of all readings [std]"
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
@@ -496,7 +506,8 @@ def _row_names_text(names: Sequence[str]) -> str:
 @register_summary("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
-        yield SummaryStatement(f"The simulation failed: {result['message']}.", "verdict")
+        said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
+        yield SummaryStatement(said, "verdict")
     else:
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group", "samples"), *rows], "Recorded", is_key_table=True)
@@ -516,9 +527,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Points", is_key_table=True)
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
-    said = result["refused"] or f"{good} of {len(result['frames'])} images are used. One fit took {spent:.0f} ms."
-    yield SummaryStatement(said, "verdict")
-    yield from (f"{count_with_noun(n, 'image')} left out, because {reason}" for reason, n in result["dropped"].items())
+    used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
+    yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
+    yield from (f"{count_with_noun(n, 'image')} not used, because {why}." for why, n in result["dropped"].items())
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 
@@ -541,13 +552,13 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if gate is None:
         return
     if gate["status"] != "done":
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}"
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
         return
-    rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
+    rows = [("replayed channel", "without estimates", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
     yield SummaryTable(rows)
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % below that of `nominal`."
+        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

@@ -119,7 +119,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
         yield SummaryStatement(f"No value counts as found until this is corrected: {'; '.join(severe)}.", "verdict")
     if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
-        yield f"These issues change no verdict, so values may be used once their causes are clear: {'; '.join(mild)}."
+        yield f"These issues change no verdict. Before you use values, follow the advice on them: {'; '.join(mild)}."
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:

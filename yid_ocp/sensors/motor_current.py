@@ -54,8 +54,9 @@ def _currents(around: base.SensorDataInputs, group: base.RecordedExtraChannelsIn
     for name in group.names:
         if name not in around.system.mechanism.joint_names:
             what, motors = f"the model has no joint '{name}', whose current is recorded", around.system.prescribed
-            hint = f"{nearest_name_question(name, motors)} Correct it in the recording, or set sensors.{key}.use: false"
-            raise DataError(what, where=where, allowed=", ".join(motors), hint=hint.strip())
+            near = nearest_name_question(name, {*motors} - {*group.names})
+            hint = f"{near} Correct it in the recording, or set sensors.{key}.use: false".strip()
+            raise DataError(what, where=where, allowed=", ".join(motors), hint=hint)
     stated = [group.noise_and_bias_stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)

@@ -91,7 +91,7 @@ def _measured(
     ]
     signs = base.expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
     if not np.all(np.abs(signs) == 1):
-        what, hint = f"the sign of {key} is {', '.join(f'{sign:g}' for sign in signs)}", "set it to -1, or leave it out"
+        what, hint = f"the sign of {key} is {', '.join(f'{s:g}' for s in signs)}", "set -1 to reverse the readings"
         raise DataError(what, where=f"sensors.{key}.constants.sign", allowed="1 or -1", hint=hint)
     sensor = kind(names, tuple(signs.tolist()), frames, key)
     values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)

@@ -104,8 +104,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                     message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                message = f"no convergence in {self.max_iterations} iterations. "
-                message += "Raise solver.max_iterations or free fewer parameters"
+                message = f"no convergence in {self.max_iterations} iterations. Raise solver.max_iterations"
                 return ended(base.Status.ITERATION_LIMIT, message)
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)

@@ -460,10 +460,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             raise ModelError(what, where=f"joint '{joint}'", allowed="a compliance above zero", hint=hint)
     for joint, servo in system.servos.items():
         if not value._is_zero_at_parameter_values(servo.dead_band):
-            key, what = (
-                f"parameters.{joint}.servo_dead_band.initial",
-                f"MuJoCo lacks the servo's dead band of '{joint}'",
-            )
+            key, what = f"parameters.{joint}.servo_dead_band.initial", f"servo '{joint}' has a dead band, MuJoCo none"
             raise ModelError(what, where=key, allowed="0", hint=f"add --set {key}=0")
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
         what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave the effect on the clock out"

@@ -222,7 +222,7 @@ class CameraCalibration:
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
     """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    text = f"The camera's clock offset is {1e3 * offset:.0f} ms as specified"
+    text = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
     text += f" (not estimated, because {reason})" * bool(reason)
     state = CameraState(pose, clock_offset=offset)
     zero = np.zeros(CAMERA_STATE_SIZE)
@@ -397,11 +397,11 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
-                off = f"The arm contradicts the fixed pose of the camera by {gap_text}, a part of each point's std"
+                off = f"The images show the arm {gap_text} from its place by the fixed pose, which std includes"
                 words.append(f"{off}. To correct the pose, set track.options.calibration.fix_pose: false")
         elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
             off = f"With its specified pose, the camera sees the arm {gap_text} from its place by the joint angles"
-            moved = f"Its pose is corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm, and its depth"
-            words.append(f"{off}. {moved} ({math.exp(-change[DEPTH_SCALE_INDEX]):.3f} times the true one) as well")
+            moved = f"Points use it corrected by {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm, and depth"
+            words.append(f"{off}. {moved} divided by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}")
         return ". ".join(words)

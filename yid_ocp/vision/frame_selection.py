@@ -303,9 +303,8 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > (most := _MAX_GRASP_GAP_CHANGE + 2 * options.max_seen_point_std):
-                off = f"it is {1e3 * away:.0f} mm away ({1e3 * most:.0f} mm are allowed). If this end moves, set "
-                reason = f"the object's first end (root) is not where other images have it: {off}"
-                reason += "track.options.root_placement: free"
+                reason = f"the object's first end (root) is {1e3 * away:.0f} mm from its place in other images "
+                reason += f"({1e3 * most:.0f} mm are allowed). If it moves, set track.options.root_placement: free"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made
 

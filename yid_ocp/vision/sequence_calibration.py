@@ -215,8 +215,8 @@ class TubeDimensionEstimates:
         for i, name in enumerate(self.names):
             value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
             two = 2 * value * self.dimension_log_ratio_std[i]
-            found = f"{value:.4g} ± {two:.2g} mm (two standard deviations) fits {self.n_frames} images, but the model "
-            found += f"says {1e3 * self.model_values[i]:.4g} mm"
+            found = f"{value:.4g} mm (95 %: {value - two:.4g} to {value + two:.4g} mm) fits {self.n_frames} images, "
+            found += f"but the model has {1e3 * self.model_values[i]:.4g} mm"
             if self.estimated_dimension_mask[i]:
                 lines.append(f"{name} is estimated: {found}")
             elif self.contradicted_model_value_mask[i]:

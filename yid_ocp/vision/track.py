@@ -426,7 +426,7 @@ class SingleFrameTracker:
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
-            raise dropped_frame_error("no part of the cloud is dense enough for a skeleton")
+            raise dropped_frame_error("the points are nowhere dense enough to trace the object")
         work.filtered = rest = cloud.select(found.node_of_point >= 0)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 

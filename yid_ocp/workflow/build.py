@@ -429,7 +429,7 @@ def marker_position_values_by_recording(
     if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
         what = f"the object's mount moves, so positions of the straight object do not determine the frame {names[0]}"
         where = ("model", "frames", names[0], "use_recorded_straight_position")
-        hint, allowed = f"set model.frames.{names[0]}.xyz instead", "an object whose mount is fixed in the world"
+        hint, allowed = f"set model.frames.{names[0]}.xyz: [x, y, z] [m] instead", "an object with a mount in the world"
         raise run.config_error(what, *where, allowed=allowed, hint=hint)
     q, kinematics = system.symbols_and_kinematics
     poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in names]

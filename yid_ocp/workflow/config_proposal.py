@@ -280,7 +280,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
         return "prescribed", f"the arm moves as measured, as it carries the object, and {seen} show the object"
-    return "prescribed", "the arm moves as measured; its efforts show the object, because no other sensor does"
+    return "prescribed", "the arm moves as measured; the object is estimated from its efforts, the only other data"
 
 
 def _commanded(joints: JointGroup) -> bool:

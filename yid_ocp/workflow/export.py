@@ -173,7 +173,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     text = calibrated.text(form, system)
     grasp = FeatureExportSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
     if form == "mjcf":
-        grasp = FeatureExportSupport("native", "equality constraints between sites, or a tendon where it gives way")
+        grasp = FeatureExportSupport("native", "equality constraints between sites (compliant grasp: a tendon)")
     parameters = {}
     for name, entry in models.support_in_export_format_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
@@ -263,7 +263,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
         after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
-        return {"status": "not done", "reason": "; ".join(filter(None, (error.what, error.hint)))}
+        return {"status": "not done", "reason": ". Try: ".join(filter(None, (error.what, error.hint)))}
     channels = {}
     for name, mismatch in after.items():
         own = attributes_to_dict(mismatch, "unit noise=noise_rms after=rmse")

@@ -12,7 +12,7 @@ from yid_ocp.analysis.friction_law_comparison import CrossValidatedFrictionLawFi
 from yid_ocp.config.settings import FrictionLawSettings, RunSettings
 from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
-from yid_ocp.errors import DataError
+from yid_ocp.errors import FAILED_ROLLOUT_ADVICE, DataError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
@@ -56,9 +56,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:
-            what = f"none of the {len(by_law)} friction laws could be fitted, the last one because: {solution.message}"
-            hint, where = "correct the issues that `yid-ocp check` lists", run.setting_location("recordings")
-            raise DataError(what, where=where, allowed="recordings that one of the laws can follow", hint=hint)
+            what = f"none of the {len(by_law)} friction laws could be fitted, the last one because {solution.message}"
+            where, allowed = run.setting_location("recordings"), "recordings that one of the laws can follow"
+            raise DataError(what, where=where, allowed=allowed, hint=FAILED_ROLLOUT_ADVICE)
         best = friction_law_comparison.simplest_fit_within_one_std_error(fits, kinds)
         settings, problem, fitted = solved[best.law]
         solution, checks = estimation.add_discretisation_errors(fitted.problem or problem, fitted, progress)

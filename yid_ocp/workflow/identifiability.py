@@ -45,7 +45,7 @@ class IdentifiabilityOptions:
     `evaluation_point`: parameter values of the analysis, from a solve or the `initial` ones. `start_knowledge`: initial
     states are `assumed` as in the settings, so that verdicts equal those of `solve`, or all `unknown` and estimated.
     `grasp_offset_std` is the prior standard deviation of grasp positions [m]; None keeps the grasps of the settings.
-    `interval_parameters` get profile likelihoods; `auto` means all in a small problem and none in a large one.
+    `interval_parameters` get profile likelihoods; `auto` means all in a small problem at a solution, otherwise none.
     """
 
     evaluation_point: Literal["solution", "initial"] = "solution"
@@ -124,7 +124,7 @@ def run_identifiability(
             information = judged()
             wanted, names = asked.interval_parameters, information.parameter_names
             if isinstance(wanted, str):
-                wanted = names if wanted == "all" or is_small_enough_for_profiles(problem) else ()
+                wanted = names if wanted == "all" or (solution and is_small_enough_for_profiles(problem)) else ()
             if tasks is not None and wanted and set(wanted) <= set(names):
                 progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
                 information = tasks.with_profile_likelihoods(information, wanted)

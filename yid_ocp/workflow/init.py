@@ -187,7 +187,7 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "object held by" if proposal.has_object else "no object is given; an unknown payload is modelled at"
+    carried = "object held by" if proposal.has_object else "no --object is given, so an unknown payload is estimated at"
     lines = [
         f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
         f"{carried}: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),
@@ -201,7 +201,7 @@ def _summary_lines(
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(f"These recordings cannot show some effects ({', '.join(kinds)}). `diagnose` leaves them out.")
+        lines.append(f"`diagnose` leaves out effects whose signals are not recorded: {', '.join(kinds)}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "

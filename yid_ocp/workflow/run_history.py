@@ -168,9 +168,9 @@ def require_runs_of_one_model(folders: Sequence[Path]) -> None:
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
         if differing := _difference(known[0][1], settings):
-            what = f"the runs are of different models: model.{differing} differs"
+            what = f"the runs are of different models: model.{differing} is not that of {known[0][0]}"
             allowed = f"{_SAME_MODEL} as in {known[0][0]}"
-            hint = "give runs of one model; to compare two models, give two runs of the same recordings"
+            hint = "give runs of one model. Two models can only be compared by runs of the same recordings"
             raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed, hint=hint)
 
 

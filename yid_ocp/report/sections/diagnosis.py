@@ -68,14 +68,12 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             values["noise alone"] = (factor * floor[channel], None)
         rows.append((channel, shown, values))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = [
-        "The figure shows the rms error of each channel on held-out recordings, and the part from noise alone."
-    ]
+    sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
     if changed:
         names = " and ".join(effect.label for effect in finding.accepted_effects)
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
         change = f"goes from {first:.3g} to {last:.3g} (noise alone gives 1)"
-        sentences.append(f"With {names}, chi² per degree of freedom {change}.")
+        sentences.append(f"With {names}, chi² per degree of freedom of held-out recordings {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
             errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
@@ -129,11 +127,11 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         maps.append((f"Recording {trace.recording}, {_NOMINAL_LABEL}", figure))
         sentences += [sentence] if i == 0 else []
     if maps:
-        sentences.append("Each map has one kept unknown in each row, over time. Red is positive, blue is negative.")
+        sentences.append("Each row of a map has one of these unknowns over time. Red is positive, blue is negative.")
     else:
-        sentences.append("No unknown explains the residual better than chance, so there is no map.")
+        sentences.append("None of these unknowns explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
-        sentences.append(f"The file trajectories.h5 has all {len(smoothed.smoothed_unknowns)} recordings.")
+        sentences.append(f"The file trajectories.h5 has values for all {len(smoothed.smoothed_unknowns)} recordings.")
     return "Where and when the gap arises", sentences, maps
 
 
