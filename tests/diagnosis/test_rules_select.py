@@ -138,7 +138,7 @@ def test_a_rival_that_is_worse_in_all_blocks_is_told_apart_however_loud_one_bloc
 
 
 @pytest.mark.parametrize(("size", "expected"), [(1.5, ["small@x"]), (9.0, ["large@x"]), (0.0, ["large@x"])])
-def test_where_a_gap_is_left_a_model_of_implausible_or_unknown_size_gives_way_to_one_that_explains_enough(size, expected):
+def test_where_a_gap_is_left_an_implausible_model_gives_way_to_one_that_explains_enough(size, expected):
     fits = [there(SMALL, 3.0, 3.1, a=size), there(LARGE, 4.0, 4.1)]
     assert nearest(fits, nominal=fit((), loss(30.0, 30.0))) == expected
     # nothing that is plausible explains three quarters
