@@ -33,8 +33,7 @@ def interleaved(system: System) -> System:
     """The same with T2's and T3's joints alternating: parents come first, branches not one after the other."""
     mechanism = system.mechanism
     names = list(mechanism.joint_names)
-    first = names.index("T2_0_x")
-    order = list(range(first))
+    order = list(range(names.index("T2_0_x")))
     for i in range(6):
         order += [names.index(f"{tube}_{i // 3}_{'xyz'[i % 3]}") for tube in ("T2", "T3")]
     new = {old: i for i, old in enumerate(order)} | {-1: -1}

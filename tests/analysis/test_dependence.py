@@ -67,8 +67,7 @@ def hanging():
 @pytest.mark.parametrize("turned", [(math.pi, 0.0, 0.0), (2.8, 0.3, 0.7), (2.0, -0.5, 1.1)])
 def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     """Also where it hangs along no axis of the world, so that its rest is straight within rounding only."""
-    along = np.array(rotation_from_rpy(*turned))[:, 2]
-    found, _, _ = judged(hanging(gravity=9.81 * along, turned=turned))
+    found, _, _ = judged(hanging(gravity=9.81 * np.array(rotation_from_rpy(*turned))[:, 2], turned=turned))
     twist, bend = found["T1.twist"], found["T1.bend"]
     assert twist.rows == tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
     assert (twist.observable_rows, twist.most_sensitive_sensor) == ((), "")

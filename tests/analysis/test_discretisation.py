@@ -406,8 +406,7 @@ def moved_hands(step, duration):
     ramp = np.minimum(t / 0.3, 1.0) ** 2
     path = np.stack([0.35 + 0.1 * ramp * np.sin(6 * t), 0.75 + 0.08 * ramp * np.sin(9 * t)], axis=1)
     theta = step.system.parameters.vector()
-    rest = EquilibriumSolver(step).solve(path[0], theta)
-    return t, path, simulate(step, theta, rest.state, len(t) - 1, path=path)
+    return t, path, simulate(step, theta, EquilibriumSolver(step).solve(path[0], theta).state, len(t) - 1, path=path)
 
 
 @pytest.mark.parametrize(("stiffness", "time_step", "stable"), [(0.5, 0.005, False), (0.5, 0.0025, True)])

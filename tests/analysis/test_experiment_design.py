@@ -159,8 +159,7 @@ def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
     [((1, 0, 0), (0, 1, 0)), ((0, 0, 1), (1, 0, 0)), ((0.64, 0.48, 0.6), (-0.64 * 0.48, 1 - 0.48**2, -0.48 * 0.6))],
 )
 def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
-    turn = "continuous", " ".join(map(str, axis))
-    robot = chain_of_motors(tmp_path, turn=turn, slide=("prismatic", "1 0 0"))
+    robot = chain_of_motors(tmp_path, turn=("continuous", " ".join(map(str, axis))), slide=("prismatic", "1 0 0"))
     springs = {"turn": StiffnessAndRest(1.0), "slide": StiffnessAndRest(1.0)}
     system = System.build(robot, springs=springs, point_frames=["hand"])
     *moving, marker = measurable_points(system)

@@ -79,8 +79,7 @@ def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
     assert mean.parameter_names == ("a", "b")
     assert degrees == 1
     assert mean.std[0] < 0.01
-    misfit = replace(run("y", [1.0, 2.0]), is_fit_adequate=False)
-    both, _, _ = pool_estimates_and_chi2([run("x", [1.0, 2.0]), misfit])
+    both, _, _ = pool_estimates_and_chi2([run("x", [1.0, 2.0]), replace(run("y", [1.0, 2.0]), is_fit_adequate=False)])
     assert (mean.is_fit_adequate, both.is_fit_adequate) == (True, False)
 
 
@@ -145,8 +144,7 @@ KINDS = {"a": ("a_1", "a_2"), "b": ("b_1",), "c": ("c_1",)}
 
 
 def fit_of(law: str, *errors: float) -> CrossValidatedFrictionLawFit:
-    by_name = dict(zip(("a_1", "a_2", "b_1", "c_1"), errors, strict=True))
-    return CrossValidatedFrictionLawFit(law, by_name, "rad", True)
+    return CrossValidatedFrictionLawFit(law, dict(zip(("a_1", "a_2", "b_1", "c_1"), errors, strict=True)), "rad", True)
 
 
 def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
@@ -176,8 +174,7 @@ TRUTH = {
 @pytest.fixture(scope="module")
 def dry(urdf_folder) -> EstimationProblem:
     """Three kinds of motion of an arm with dry friction, as its own model has them, and one with motors off."""
-    friction = [("joint_coulomb", "shoulder", {})]
-    step = pendulum_step(urdf_folder, friction, driven=PENDULUM, servos=ServoModelOptions())
+    step = pendulum_step(urdf_folder, [("joint_coulomb", "shoulder", {})], driven=PENDULUM, servos=ServoModelOptions())
     made = []
     t = 0.01 * np.arange(81)
     for name, rate in (("slow_1", 4.0), ("slow_2", 5.0), ("fast_1", 11.0), ("turn_1", 7.0)):

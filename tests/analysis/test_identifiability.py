@@ -96,8 +96,7 @@ def test_a_parameter_at_zero_is_as_large_as_its_scale(value, relative):
 
 
 def test_what_was_known_beforehand_is_not_something_that_a_sensor_sees():
-    problem = Formula(lambda x: [3 * (x["a"] / 2 - 1), 40 * (x["a"] / 2 - 1)], {"a": 2.0}, stated=1)
-    info = identifiability(problem)
+    info = identifiability(Formula(lambda x: [3 * (x["a"] / 2 - 1), 40 * (x["a"] / 2 - 1)], {"a": 2.0}, stated=1))
     assert info.parameters["a"].std_relative == pytest.approx(1 / math.hypot(3, 40))
     assert info.parameters["a"].std_alone == pytest.approx(1 / 3)
     np.testing.assert_allclose(info.fisher_information, [[9.0]])

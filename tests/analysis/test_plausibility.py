@@ -526,8 +526,7 @@ def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
     change, posed, cause, words = ROLLED[case]
     place = np.random.default_rng(4).uniform(-1, 1, (20, 3, 3)) + np.arange(3.0)
     sensor, at = points("a", "b", "c", pose=POSE if posed else None, group="points_camera"), np.arange(20)
-    samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
-    episode = SimpleNamespace(name="run", measurements=(samples,))
+    episode = SimpleNamespace(name="run", measurements=(measured(sensor, at, 0.0 * at, change(place).reshape(20, 9)),))
     result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
     found = list(correctable_object_point_issues(episode, result, 2.0))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
@@ -684,8 +683,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
     more = {"effort_std": 0.02, "effort_kind": "command", "position_std": 1e-3}
     arm = joints(("shoulder",), t, 0.4 * np.sin(5 * t)[:, None], effort=2 * np.cos(5 * t)[:, None], **more)
     camera = seen(["tip"], t[4:-4:4], np.zeros((74, 1, 3)), "points_camera", std=np.full((74, 1, 3), 2e-3))
-    source = EstimationProblem(step, [recording(arm, camera)], ["elbow.stiffness"])
-    made = source.simulate_synthetic_recording(seed=1)
+    made = EstimationProblem(step, [recording(arm, camera)], ["elbow.stiffness"]).simulate_synthetic_recording(seed=1)
     moved = replace(made.points[0], t=1.5 + 1.02 * (made.points[0].t - 1.5))
     problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
     solution = fit_problem(problem, GaussNewton(), restarts=False)

@@ -154,8 +154,7 @@ def test_workers_find_what_one_process_does(run, tmp_path):
     known = {"start_knowledge": "unknown", "grasp_offset_std": 0.01}
     asked = IdentifiabilityOptions(interval_parameters="all", rank_changes=True, **known)
     alone = run_identifiability(run, tmp_path / "alone", options=asked)
-    shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=InlineExecutor())
-    assert read(shared) == read(alone)
+    assert read(run_identifiability(run, tmp_path / "shared", options=asked, workers=InlineExecutor())) == read(alone)
     assert {path.name for path in tmp_path.iterdir()} == {"alone", "shared"}
 
 

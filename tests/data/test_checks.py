@@ -200,8 +200,7 @@ def test_nothing_moves():
     rng, group = np.random.default_rng(1), RECORDING.points[0]
     position, velocity = STD * rng.standard_normal(POSITION.shape), 5e-3 * rng.standard_normal(POSITION.shape)
     still = replace(group, position=1 + 5e-3 * rng.standard_normal(group.position.shape))
-    resting = changed(RECORDING, position=position, velocity=velocity)
-    assert causes(replace(resting, points=(still,))) == {"standstill"}
+    assert causes(replace(changed(RECORDING, position=position, velocity=velocity), points=(still,))) == {"standstill"}
 
 
 def test_one_measurement_listed_twice_is_told_also_in_part():

@@ -49,8 +49,7 @@ def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
     rows = ["0.0,0.1,1,2,3,,,", "0.5,0.2,,,,0.1,0.2,0.3", "1.0,0.3,4,5,6,0.4,0.5,0.6"]
     (tmp_path / "run.csv").write_text("\n".join([header, *rows]))
     columns = {f"w{i + 1}": f"angular_velocity_{axis}:imu_link" for i, axis in enumerate("xyz")}
-    recording = read_any(tmp_path / "run.csv", column_meanings=columns)
-    imu, wrist = sorted(recording.channel_groups, key=lambda g: g.name)
+    imu, wrist = sorted(read_any(tmp_path / "run.csv", column_meanings=columns).channel_groups, key=lambda g: g.name)
     assert (imu.name, imu.names, wrist.name, wrist.names) == ("imu", ("imu_link",), "wrist", ("ft",))
     np.testing.assert_allclose(wrist.t, [0.0, 1.0])
     np.testing.assert_allclose(wrist.values_by_quantity["force"][:, 0], [[1, 2, 3], [4, 5, 6]])

@@ -77,8 +77,7 @@ def test_a_torque_without_a_name_is_found_at_its_joint_as_a_function_of_its_quan
     assert law.tables[0].knots[0] < low < high < law.tables[0].knots[-1]
     [table] = law.tables
     inner = slice(2, -2)
-    true = truth(table.knots, table.knots)
-    assert np.all(np.abs(table.torque - true)[inner] < 3 * table.torque_std[inner] + 0.02)
+    assert np.all(np.abs(table.torque - truth(table.knots, table.knots))[inner] < 3 * table.torque_std[inner] + 0.02)
 
 
 def test_an_effect_is_no_surer_than_a_law_of_what_is_left_moves_it(system, urdf_folder):
@@ -116,8 +115,7 @@ def test_the_torque_of_a_law_is_the_spline_through_its_table_and_constant_beyond
     start = np.concatenate([path[0], np.zeros(2)])
     efforts = [simulate(s, s.system.parameters.vector(), start, 200, None, path).effort for s in (plain, with_law)]
     middle = (path[1:, 1] + path[:-1, 1]) / 2
-    spline = scipy.interpolate.CubicSpline(table.knots, table.torque, bc_type="natural")
-    expected = spline(np.clip(middle, -0.5, 0.7))
+    expected = scipy.interpolate.CubicSpline(table.knots, table.torque, bc_type="natural")(np.clip(middle, -0.5, 0.7))
     # a prescribed joint's effort at a node has half of the force on either side
     np.testing.assert_allclose((efforts[0] - efforts[1])[1:, 1], (expected[1:] + expected[:-1]) / 2, atol=1e-9)
     np.testing.assert_allclose(table.interpolated_torque(middle), expected, atol=1e-12)

@@ -128,8 +128,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
 
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
-    ensemble = drawn()
-    found = ensemble.simulate_synthetic_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
+    found = drawn().simulate_synthetic_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
     assert (found.name, found.description, found.source, found.true_parameters) == ("case_001", "", "", {})
     [made] = drawn.made
     assert (made["truth"], made["injected"]) == ({"T1.bend": 7.0}, (KV,))

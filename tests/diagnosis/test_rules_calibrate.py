@@ -116,8 +116,7 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
     assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 2
     assert found["settings"]["gap_significance_level"] == 2.3e-5
-    few = calibrated(clean[0])
-    assert few["settings"]["gap_significance_level"] == 1e-4, "no less sure than odds that convince"
+    assert calibrated(clean[0])["settings"]["gap_significance_level"] == 1e-4, "no less sure than odds that convince"
 
 
 @pytest.mark.parametrize(

@@ -293,8 +293,7 @@ class _Reader:
         values: dict[str, Any] = {}
         for name, option in options.class_options_by_key(kind).items():
             if name in raw:
-                default = option.default_value
-                values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name), default)
+                values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name), option.default_value)
             elif option.default_value is MISSING:
                 allowed, hint = options.describe_type(option.type_hint), f"add {self._name((*path, name))}: VALUE"
                 raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=allowed, hint=hint)

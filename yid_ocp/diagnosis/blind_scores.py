@@ -429,16 +429,11 @@ def _recommended_settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, f
     for own in rules.values():
         most, value, limit = own["side"] == "most", own["quantile"], float(own["limit"])
         if value is not None:
-            outwards = _rounded(value, up=most)
+            context = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING if most else decimal.ROUND_FLOOR)
+            outwards = float(context.create_decimal(f"{value:.10g}"))  # more digits are numerical errors
             limit = max(limit, outwards) if most else min(limit, outwards)
         settings[own["setting"]] = max(limit, settings.get(own["setting"], limit))
     return settings
-
-
-def _rounded(value: float, up: bool) -> float:
-    """Return a number rounded up or down to two significant digits."""
-    context = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING if up else decimal.ROUND_FLOOR)
-    return float(context.create_decimal(f"{value:.10g}"))  # without the last digits, which are numerical errors
 
 
 _EVIDENCE_FORMAT = "yid-evidence/3"  # 2 had no chi2 of one fit to all recordings

@@ -321,8 +321,7 @@ class System(ReprMixin):
         """Return a copy with added effects. Their parameters are appended to theta in the given order."""
         system = self
         for effect in effects:
-            added = system.parameters.with_added(effect.parameters)
-            system = effect.apply_to_system(replace(system, parameters=added))
+            system = effect.apply_to_system(replace(system, parameters=system.parameters.with_added(effect.parameters)))
             system = replace(system, effects=(*system.effects, effect))
         return system
 

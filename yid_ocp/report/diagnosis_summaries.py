@@ -93,7 +93,11 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield "Issues of the recordings may have caused this verdict. Correct the issues, then diagnose again."
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
-        yield CodeBlock(_planning_command(result["next_plan"]))
+        known = result["next_plan"].items()
+        texts = {key: f"[{', '.join(value)}]" if isinstance(value, list) else value for key, value in known}
+        settings = (word for key, text in texts.items() for word in ("--set", f"plan.{key}={text}"))
+        file = Path(texts["parameter_run_folder"]) / "config.yaml"
+        yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
     yield from copyable_estimates_blocks(result)
     yield f"verdict: {verdict} ({sum(result['seconds'].values()):.1f} s)"
 
@@ -111,12 +115,6 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
-
-
-def _planning_command(section: Mapping[str, Any]) -> str:
-    texts = {key: f"[{', '.join(value)}]" if isinstance(value, list) else value for key, value in section.items()}
-    settings = (word for key, text in texts.items() for word in ("--set", f"plan.{key}={text}"))
-    return shlex.join(["yid-ocp", "plan", str(Path(section["parameter_run_folder"]) / "config.yaml"), *settings])
 
 
 @register_summary("yid-blind/1")

@@ -333,8 +333,7 @@ def parameter_values_by_source_figure(
     else:
         # bars of undetermined parameters would compress all others
         _set_axis(figure, "xaxis", range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
-    ends = [len(names) - 0.5, -0.5]
-    return _set_axis(figure, "yaxis", tickvals=list(range(len(names))), ticktext=names, range=ends)
+    return _set_axis(figure, "yaxis", tickvals=list(range(len(names))), ticktext=names, range=[len(names) - 0.5, -0.5])
 
 
 def confusability_matrix_figure(names: Sequence[str], values: Array) -> _Figure:

@@ -237,8 +237,7 @@ class _Maker:
         """The program, with an initial guess near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
-        error = partial(mean_square_of_non_effort_residuals, problem)
-        found = guess_unknowns_and_node_states(problem, nodes, x, error)
+        found = guess_unknowns_and_node_states(problem, nodes, x, partial(mean_square_of_non_effort_residuals, problem))
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
         self._w.assign_block_name("theta", theta[:, None], problem.shared_parameters)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis import step_diagnostics
-from yid_ocp.analysis.step_symbols import EquationOrDerivativeFormula, NamedStepEquations
+from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
@@ -31,6 +31,7 @@ from yid_ocp.workflow.prediction_outputs import store_texts
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
+_ENTRY_KEYS = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
 _INSPECTED_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (
     "parameter unit rows seen=observable_rows best=most_sensitive_sensor read=directly_dependent_sensors "
@@ -105,7 +106,12 @@ def _run_inspect(
                 "spectral_radius": float(np.max(np.abs(np.linalg.eigvals(matrices["A"])), initial=0.0)),
             },
             "asked": named,
-            "entries": [_entry_result(entry, symbols, at) for entry in chosen],
+            "entries": [
+                attributes_to_dict(entry, _ENTRY_KEYS)
+                | {"operations": entry.formula.n_operations}
+                | {"value": entry.evaluate_numerically(symbols.all_variable_symbols, at)}
+                for entry in chosen
+            ],
             "exported": [str(path) for path in files],
         }
         written = folder.write_result_and_report(run, progress, result, section_data={"pictures": [picture]})
@@ -199,12 +205,6 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
     marked, nonzero = pattern.marked_mask, pattern.nonzero_mask
     count = None if marked is None else int(np.count_nonzero(nonzero & marked))
     return {"shape": list(nonzero.shape), "nonzeros": pattern.n_nonzeros, "at_point": count, "title": pattern.title}
-
-
-def _entry_result(entry: EquationOrDerivativeFormula, symbols: NamedStepEquations, at: Array) -> dict[str, Any]:
-    names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
-    value = entry.evaluate_numerically(symbols.all_variable_symbols, at)
-    return attributes_to_dict(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:
