@@ -217,7 +217,7 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
 
 def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     origin, grid = np.zeros((5, 3)), TimeGrid(0.0, 0.1, 4)
-    with pytest.raises(DataError, match="'o' and 'd', which give a clamp's direction, coincide"):
+    with pytest.raises(DataError, match="its points 'o' and 'd' coincide at 0 s"):
         path_of(clamped(origin, origin), grid)
     hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
     hidden[1, 2] = math.nan
