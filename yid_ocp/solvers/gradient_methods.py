@@ -131,8 +131,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             # the parabola through both costs with the slope of the first has its minimum at this fraction of the step
             slope = float(residual @ (jacobian @ step))
             fraction = -0.5 * slope / max(trial.cost - now.cost - slope, 1e-300) if trial.ok else _LENGTH_AFTER_FAILURE
-            longest = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled))
-            rejected = True
+            longest, rejected = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled)), True
             if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)

@@ -141,8 +141,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if watch.stop_request is not None:
             raise watch.stop_request
         w = w if np.all(np.isfinite(w)) else watch.best
-        defect = float(ca.norm_inf(functions(w, program.parameter_values)[2]))
-        stats = solver.stats()
+        defect, stats = float(ca.norm_inf(functions(w, program.parameter_values)[2])), solver.stats()
         status, message = self._ipopt_status(stats["return_status"], defect)
         n = problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)

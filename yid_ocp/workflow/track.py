@@ -71,8 +71,10 @@ def _run_track(
                     found = tracker.track_result_from_frame_reports(frames, note, common)
                 except DataError as error:
                     refused = error
-        except YidError:
+        except YidError as error:
             tasks.delete_files()
+            if made is not None and str(folder.resume_folder) in error.where:  # rendered frames, which are not kept
+                error.where = run.setting_location("track", "virtual_frames")
             raise
         progress.begin_stage("drawing pictures")
         for frame in _drawn(frames, settings.n_drawn_frames):
