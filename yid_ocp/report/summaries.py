@@ -252,11 +252,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)."
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    text += ", at the values of a fit that did not converge" * (result["status"] not in ("converged", "not_solved"))
     yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    text = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}." if lost else ""
-    yield SummaryStatement(text, "verdict")
+    said = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}."
+    yield SummaryStatement(said if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")

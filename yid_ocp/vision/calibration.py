@@ -125,8 +125,7 @@ def _nearby(arm: MovingArmSurface, origin: Array, t: float, points: Array, start
         step = -np.linalg.solve(hessian, slope.T @ met.normal_distance + prior * x)
         x += np.clip(step, -_MAX_CLOCK_STEP, _MAX_CLOCK_STEP)
     error = arm.match_points_to_surface(points + x[1:], origin, t - x[0], _OFF_ARM_DISTANCE, along=True).normal_distance
-    on_arm = np.count_nonzero(np.abs(error) < _REACH_FACTORS[-1] * _OFF_ARM_DISTANCE)
-    std = math.inf
+    on_arm, std = np.count_nonzero(np.abs(error) < _REACH_FACTORS[-1] * _OFF_ARM_DISTANCE), math.inf
     if on_arm >= max(_MIN_ON_ARM_FRACTION * len(points), MIN_ARM_POINTS_PER_FRAME):
         std = sigma * math.sqrt(_CORRELATED_GROUP_SIZE * float(np.linalg.inv(hessian)[0, 0]))
     return _StampDelay(float(x[0]), std, _mean_square(error, len(points)))
