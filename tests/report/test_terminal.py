@@ -101,6 +101,9 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", lost)
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "from", "0"]
     assert "±" not in "".join(lines[1:-4])
+    said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD)))
+    parts = "The fit did not converge. Its", "limit after 4 iterations in all", "do not determine", "does not explain"
+    assert [part in said for part in parts] == [True, True, False, False]
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
     assert "The fit failed, so do not use the values. They are the best that were reached, " in " ".join(lines)

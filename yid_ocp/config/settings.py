@@ -452,7 +452,8 @@ class RunSettings:
     def setting_location(self, *path: str | int) -> str:
         """Return the place of a setting (file, line and key) as text, for the `where` of an error message."""
         key, place = ".".join(map(str, path)), innermost_location(self.key_locations, path) or self.config_file
-        return place if place == f"--set {key}" else ": ".join(filter(None, (place, key)))
+        is_told = place in (f"--set {key}", f"--set {key.rstrip('.0123456789')}")  # of a list, an error names the entry
+        return place if is_told else ": ".join(filter(None, (place, key)))
 
     def config_error(self, what: str, *path: str | int, hint: str, allowed: str = "") -> ConfigError:
         """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""

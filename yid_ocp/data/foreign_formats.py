@@ -145,8 +145,7 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     for i in range(2, min(len(axes) - 2, len(names))):
         if quantities[i : i + 3] == ["Position"] * 3 and axes[i : i + 3] == ["X", "Y", "Z"] and names[i]:
             columns.setdefault(names[i], range(i, i + 3))
-    table = _numbers(body, len(axes), where)
-    unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
+    table, unit = _numbers(body, len(axes), where), _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
     notes = ["Motive's y axis is up by default, and positions are not rotated. Check that the export has z up"]
     if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
         notes.append("rigid bodies and markers without a position were left out")
@@ -219,7 +218,9 @@ def _numbers(rows: Sequence[Sequence[str]], n_columns: int, where: str) -> Array
         for j, cell in enumerate(row[:n_columns]):
             if cell and cell.upper() != "NULL":
                 if not _is_number(cell):
-                    raise _broken(f"{where}, row {i + 1} of the data", f"numbers in place of '{cell}'")
+                    place, hint = f"{where}, row {i + 1} of the data", "export the motion again, or empty this cell"
+                    allowed = "numbers, NULL and empty cells"
+                    raise DataError(f"the cell '{cell}' is not a number", where=place, allowed=allowed, hint=hint)
                 table[i, j] = float(cell)
     return table
 

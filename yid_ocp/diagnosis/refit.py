@@ -19,7 +19,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.display import PartsDoneCounter, Progress
+from yid_ocp.display import PartsDoneCounter, Progress, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
@@ -411,8 +411,8 @@ def refit_with_each_effect(
     """
     if not tried:
         return []
-    noun, head = ("effects", "pairs")[len(tried[0][0]) - 1], ("effects", "held-out chi2/n")
-    text = f"refitting {join_effect_labels(base)} with each of {len(tried)} {noun}"
+    head, added = ("effects", "held-out chi2/n"), count_with_noun(len(tried), ("effect", "pair")[len(tried[0][0]) - 1])
+    text = f"refitting {join_effect_labels(base)} with {'each of ' * (len(tried) > 1)}{added}"
     # one effect is often enough; otherwise pairs, more effects and replacements follow
     search.progress.begin_stage(text, 2 + 0.5 * len(tried), (10.0, 16.0, 11.0)[min(len(base), 2)])
     parts = PartsDoneCounter(search.progress, len(tried), join_effect_labels(tried[0][0]))

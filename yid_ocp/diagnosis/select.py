@@ -256,8 +256,7 @@ def select_effects(
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
         if promised < limits.min_explained_fraction * max(2 * nominal.cost - nominal.residual_count, 1.0):
             break
-        shortlist = _refit_shortlist(seen, limits)
-        fits = refit_with_each_effect(search, base, shortlist, better.values)
+        fits = refit_with_each_effect(search, base, _refit_shortlist(seen, limits), better.values)
         if len(base) == 1:
             pairs = _pairs_to_refit(search, screened, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")

@@ -366,13 +366,13 @@ def check_rest_effort_and_spring_limits(
 
 
 def solve_equilibrium_at_point_target(
-    step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, target: Array, tolerance: float
+    step: Step, theta: Array, start: Equilibrium, point: FramePositionEvaluator, target: Array, options: PlanOptions
 ) -> Equilibrium:
     """Find an equilibrium within the joint limits at which a point is at its target, from the initial guess `start`.
 
-    Raises `ConfigError` if no joint moves the point, or if the point stays over 1.5 `tolerance` [m] from the target.
+    Raises `ConfigError` if no joint moves the point, or if it stays over 1.5 `position_tolerance` from the target.
     """
-    statics, system = EquilibriumSolver(step), step.system
+    statics, system, tolerance = EquilibriumSolver(step), step.system, options.position_tolerance
     n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
 
     def point_and_slope(rest: Equilibrium) -> tuple[Array, Array]:
@@ -381,7 +381,8 @@ def solve_equilibrium_at_point_target(
 
     if np.abs(point_and_slope(start)[1]).max(initial=0.0) < _MIN_POINT_MOBILITY:
         what, allowed = f"no joint moves the point '{point.names[0]}'", "a frame of a moving link or a grasped object"
-        raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or choose another point")
+        hint = "choose another point" + ", or set model.grasp" * (not system.grasps)
+        raise ConfigError(what, where="plan.point", allowed=allowed, hint=hint)
     guess = [start.state[:n]]
 
     @memoize_last_call
@@ -406,9 +407,10 @@ def solve_equilibrium_at_point_target(
         near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
         names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
         limits = f", with {names} at the joint's limit" if names else ""
-        what = f"the target is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
-        where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in target)} m in the world)"
+        place = f"({', '.join(f'{x:.4g}' for x in target)}) m in the world"
+        what = f"the target {place} is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
         hint = "set a nearer target, a smaller plan.point_target_offset_from_start, or other plan.start_joint_positions"
+        where = f"plan.{'point_target_offset_from_start' if options.target_position is None else 'target_position'}"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
 

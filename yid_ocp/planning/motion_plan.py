@@ -92,7 +92,7 @@ def plan_motion_to_target(
     if inside is not None:
         _check_box(options, inside, mover.frame_positions_along_states(inside, start.state[None])[0], place)
     check_rest_effort_and_spring_limits(step, values, start, options.limits, "where the motion begins")
-    end = solve_equilibrium_at_point_target(step, values, start, point, place, options.position_tolerance)
+    end = solve_equilibrium_at_point_target(step, values, start, point, place, options)
     check_rest_effort_and_spring_limits(step, values, end, options.limits, "where it ends")
 
     def attempt(duration: float) -> TargetMotionPlan:

@@ -54,9 +54,10 @@ _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an eq
 @register_summary("yid-solve/1")
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
-    failed = result["status"] == "failed"
+    failed, converged = result["status"] == "failed", result["status"] == "converged"
     if not failed:
-        yield from misfit_summary_blocks(result["fit"], free)
+        said = "The fit did not converge. Its misfit and verdicts hold at its last values, not for the recordings."
+        yield from misfit_summary_blocks(result["fit"], free) if converged else [SummaryStatement(said, "conclusion")]
         yield from (SummaryStatement(text, "conclusion") for text in result.get("discretisation_notes", ()))
         yield from (SummaryStatement(text, "conclusion") for text in _prediction_sentences(result))
     yield from issue_summary_blocks(result)
@@ -80,16 +81,16 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
         yield SummaryStatement(f"{said} If a simulation failed, {FAILED_ROLLOUT_ADVICE}.", "verdict")
     else:
-        texts = *_found_and_lost(free), unused_efforts_sentence(result)
+        texts = *(_found_and_lost(free) if converged else ()), unused_efforts_sentence(result)
         yield from (SummaryStatement(text, "verdict") for text in texts)
         if result["fit"]["explains"]:
             yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
     yield from copyable_estimates_blocks(result)
     yield result.get("safeguard", "")
-    steps = f"{count_with_noun(result['iterations'], 'iteration')} ({result['seconds']:.1f} s)"
-    steps += ", so do not use the values" * (result["status"] == "stalled")
+    steps = count_with_noun(result["iterations"], "iteration") + " in all" * (result["status"] == "iteration_limit")
+    steps += f" ({result['seconds']:.1f} s)" + ", so do not use the values" * (result["status"] == "stalled")
     ended = f"{result['status'].replace('_', ' ')} after {steps}: {result['message']}"
-    yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
+    yield SummaryStatement(ended, "note" if converged else "conclusion")
 
 
 def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
@@ -251,11 +252,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)."
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    text += ", at the values of a fit that did not converge" * (result["status"] not in ("converged", "not_solved"))
     yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    text = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}." if lost else ""
-    yield SummaryStatement(text, "verdict")
+    said = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}."
+    yield SummaryStatement(said if lost else "", "verdict")
 
 
 @register_summary("yid-friction/1")
@@ -277,7 +279,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(constants, f"Friction by the law '{best}'")
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
     said = f"These recordings do not determine the following parameters: {lost}."
-    yield SummaryStatement(said if lost else "", "verdict")
+    yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     yield "Noise alone gives 1 std. If all errors are far larger, run `yid-ocp diagnose`." if unit == "std" else ""
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
@@ -421,8 +423,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    size = f"The model has {len(roles)} coordinates ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}."
-    yield SummaryStatement(size, "verdict")
+    size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
+    yield SummaryStatement(f"The model has {size}.", "verdict")
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     values = {n: abs(result["parameters"][n]["value"]) for n in changes}
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
@@ -525,8 +527,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Points", is_key_table=True)
-    good = sum(not frame["reason"] for frame in result["frames"])
-    spent = 1e3 * result["fit_seconds"]
+    good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
     used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
     yield from (f"{count_with_noun(n, 'image')} not used, because {why}." for why, n in result["dropped"].items())

@@ -172,8 +172,7 @@ def misfit_summary_blocks(
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
-    said = []
-    kinds = {"links": "twice the links", "time_step": "half the time step"}
+    said, kinds = list[str](), {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "the stated encoder noise once more"
     limits = " This assumes that the noise is as stated (sensors.joints.position.std), and tests for no other error."
     for key, words in kinds.items():
@@ -186,8 +185,9 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
             remedy = f" To cure this, set {setting}." if (setting := result.get("finer_settings", {}).get(key)) else ""
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{remedy}")
         elif tried:
-            said.append(f"With {words}, no estimate would change by more than its ± from the recordings.")
-            said[-1] += limits if key == "encoder_noise" else ""
+            is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
+            end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")
+            said.append(f"With {words}, no estimate would change by more than its ± from the recordings{end}")
     return said
 
 

@@ -49,7 +49,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
     lower the cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
     """
 
-    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 100
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps per start and per weighting")] = 100
     step_tolerance: Annotated[
         float,
         Gt(0),
@@ -104,7 +104,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                     message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                message = f"no convergence in {self.max_iterations} iterations. Raise solver.max_iterations"
+                message = f"the search reached its limit (solver.max_iterations: {self.max_iterations}). Raise it"
                 return ended(base.Status.ITERATION_LIMIT, message)
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
@@ -131,8 +131,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             # the parabola through both costs with the slope of the first has its minimum at this fraction of the step
             slope = float(residual @ (jacobian @ step))
             fraction = -0.5 * slope / max(trial.cost - now.cost - slope, 1e-300) if trial.ok else _LENGTH_AFTER_FAILURE
-            longest = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled))
-            rejected = True
+            longest, rejected = float(np.clip(fraction, 0.1, 0.5) * np.linalg.norm(scaled)), True
             if np.max(np.abs(scaled)) < self.step_tolerance:
                 if is_stationary_point(problem, x, now):
                     return ended(base.Status.CONVERGED, _LOWEST)
@@ -298,5 +297,5 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, size))
-        message = f"no convergence in {self.max_iterations} iterations, as is usual for this method. Use gauss_newton"
-        return ended(base.Status.ITERATION_LIMIT, message)
+        limit = f"the search reached its limit (solver.max_iterations: {self.max_iterations})"
+        return ended(base.Status.ITERATION_LIMIT, f"{limit}, as is usual for this method. Use gauss_newton")

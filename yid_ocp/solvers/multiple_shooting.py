@@ -141,8 +141,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if watch.stop_request is not None:
             raise watch.stop_request
         w = w if np.all(np.isfinite(w)) else watch.best
-        defect = float(ca.norm_inf(functions(w, program.parameter_values)[2]))
-        stats = solver.stats()
+        defect, stats = float(ca.norm_inf(functions(w, program.parameter_values)[2])), solver.stats()
         status, message = self._ipopt_status(stats["return_status"], defect)
         n = problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
@@ -168,7 +167,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
             return base.Status.CONVERGED, f"IPOPT found a minimum. {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT stopped after {self.max_iterations} iterations. {closed}"
+            limit = f"IPOPT reached its limit (solver.max_iterations: {self.max_iterations}). {closed}"
             return base.Status.ITERATION_LIMIT, f"{limit}. Raise solver.max_iterations"
         return base.Status.STALLED, f"IPOPT found no minimum ({returned}). {closed}. Use gauss_newton"
 
@@ -187,8 +186,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             return ended(base.Status.FAILED, now)
         mu, filtered = 1e-4, _StepFilter(now)
         for _ in range(self.max_iterations):
-            size = np.maximum(np.abs(x), problem.unknown_scales)
-            gradient = now.jacobian.T @ now.residual
+            size, gradient = np.maximum(np.abs(x), problem.unknown_scales), now.jacobian.T @ now.residual
             recorder.record_iterate(now.cost, x, max_abs_projected_gradient(x, gradient, *problem.bounds, size))
             closed = now.residual + now.by_defect
             # the linear model holds for changes by a factor, not to a bound
@@ -222,8 +220,8 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
                     return ended(base.Status.STALLED, f"{reason}. Set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        limit = f"no convergence in {self.max_iterations} iterations (largest jump at a node: {now.defect:.1e})"
-        return ended(base.Status.ITERATION_LIMIT, f"{limit}. Raise solver.max_iterations")
+        limit = f"the search reached its limit (solver.max_iterations: {self.max_iterations})"
+        return ended(base.Status.ITERATION_LIMIT, f"{limit}. Raise it. Largest jump at a node: {now.defect:.1e}")
 
 
 class _AdaptiveRidge(ca.Callback):

@@ -7,6 +7,7 @@ Effects from plug-ins are therefore treated like those of the library.
 from __future__ import annotations
 
 import functools
+import logging
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
@@ -338,8 +339,8 @@ def _bodies(
                 elements[j].set("gravcomp", format_xml_numbers([1 - weights[joint.name]]))
             SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
-            what, hint = f"nothing that '{joint.name}' moves has a mass", "give its link a mass, or lock the joint"
-            raise ModelError(what, where=f"joint '{joint.name}'", allowed="joints that move a mass", hint=hint)
+            what, hint = f"MuJoCo needs a mass on the link of '{joint.name}'", "give the link a mass, or lock the joint"
+            raise ModelError(what, where=f"joint '{joint.name}'", allowed="joints whose link has a mass", hint=hint)
     return elements
 
 
@@ -424,7 +425,9 @@ def _add_actuators(system: System, value: CasadiEvaluator, actuator: Element, ti
 
 def import_mujoco(what: str = "virtual experiments need MuJoCo") -> ModuleType:
     """Import the mujoco package. Raises `DataError` with the text `what` if it is not installed."""
-    return import_optional("mujoco", "blind", what)
+    mujoco = import_optional("mujoco", "blind", what)
+    mujoco.set_mju_user_warning(logging.getLogger(__name__).info)  # else on the terminal and in MUJOCO_LOG.TXT
+    return mujoco
 
 
 def mujoco_model_from_mjcf_text(text: str) -> Any:

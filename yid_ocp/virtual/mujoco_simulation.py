@@ -330,7 +330,7 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
         if _lost(scene):
             what = "the simulation diverged before the motion began, while the object settled"
-            hint = "pass a shorter time_step, or initial_joint_angles nearer to the grasp"
+            hint = "start with joint angles nearer to the grasp, or simulate with a shorter time step"
             raise ModelError(what, where="MuJoCo", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)

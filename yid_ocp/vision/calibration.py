@@ -125,8 +125,7 @@ def _nearby(arm: MovingArmSurface, origin: Array, t: float, points: Array, start
         step = -np.linalg.solve(hessian, slope.T @ met.normal_distance + prior * x)
         x += np.clip(step, -_MAX_CLOCK_STEP, _MAX_CLOCK_STEP)
     error = arm.match_points_to_surface(points + x[1:], origin, t - x[0], _OFF_ARM_DISTANCE, along=True).normal_distance
-    on_arm = np.count_nonzero(np.abs(error) < _REACH_FACTORS[-1] * _OFF_ARM_DISTANCE)
-    std = math.inf
+    on_arm, std = np.count_nonzero(np.abs(error) < _REACH_FACTORS[-1] * _OFF_ARM_DISTANCE), math.inf
     if on_arm >= max(_MIN_ON_ARM_FRACTION * len(points), MIN_ARM_POINTS_PER_FRAME):
         std = sigma * math.sqrt(_CORRELATED_GROUP_SIZE * float(np.linalg.inv(hessian)[0, 0]))
     return _StampDelay(float(x[0]), std, _mean_square(error, len(points)))
@@ -224,8 +223,7 @@ def calibration_without_estimation(pose: Array, options: CameraClockOptions, rea
     offset = options.initial_stamp_minus_joint_time
     text = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
     text += f" (not estimated, because {reason})" * bool(reason)
-    state = CameraState(pose, clock_offset=offset)
-    zero = np.zeros(CAMERA_STATE_SIZE)
+    state, zero = CameraState(pose, clock_offset=offset), np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
 
@@ -339,8 +337,6 @@ class _Calibrator:
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
             few.append(StampedCloud(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False)))
         tried = candidate_camera_states(self.arm, few, self.told, self.clock.search_half_width)
-        if not tried:
-            raise _UntoldError("the arm is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0
         for trial in tried:
             for reach in _STAGE_REACHES:
@@ -384,8 +380,7 @@ class _Calibrator:
 
     def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
         stds = np.sqrt(np.diag(covariance))
-        searched = self.clock.search_half_width > 0
-        known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms" if searched else "ms as specified"
+        known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms" if self.clock.search_half_width > 0 else "ms as specified"
         words = [f"The camera's clock offset (stamp minus joint time) is {1e3 * state.clock_offset:.1f} {known}"]
         if abs(state.clock_drift) > 2 * (drift := stds[CLOCK_DRIFT_INDEX]):
             words.append(f"It drifts by {1e3 * state.clock_drift:.2f} ± {1e3 * drift:.2f} ms per second")

@@ -189,7 +189,7 @@ def times_configurations_points_of_good_frames(
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_seen_point_std).all())
         limit = f"the smallest std is {best:.0f} mm, but must be at most {1e3 * options.max_seen_point_std:g} mm"
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
-        check = f"check track.camera_pose and the camera's clock ({calibration.message})"
+        check = f"check track.camera_pose and the camera's clock. {calibration.message}"
         allowed = "a std of at most track.options.max_seen_point_std for one point in one frame"
         raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))

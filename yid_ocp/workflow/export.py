@@ -45,7 +45,7 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_prog
 from yid_ocp.workflow.import_recording import recording_summary_dict
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
-from yid_ocp.workflow.run_inputs import input_files_by_name, read_recordings_of_role
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 _FORMAT_BY_ENDING = {"": "mjcf", "xml": "mjcf", "yml": "yaml", "world": "sdf"}  # of other endings, the ending itself
@@ -155,10 +155,10 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         allowed, where = ", ".join(_MODEL_FORMATS), "--format, or the ending of --out"
         what, hint = f"there is no format '{form}' of a model", f"write --format mjcf{why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
+    if out.is_file():
+        what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
+        raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
     calibrated = _read_calibrated_model(folder)
-    if out.exists() and any(map(out.samefile, input_files_by_name(calibrated.nominal_settings).values())):
-        what, hint = "the file to write is an input of the run", "choose another --out"
-        raise OutputError(what, where=str(out), allowed="a file that the run does not read", hint=hint)
     progress.begin_stage("building the model")
     full = calibrated.system()
     if form == "yaml":
@@ -379,8 +379,7 @@ def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTop
     """Yield the time series of a sensor: one topic for all joints, or one per point (residuals as vectors)."""
     channels, t = [*map(str, sensor.attrs["channels"])], np.array(sensor["t"])
     if values.shape[1] == len(channels):
-        quantity = channels[0].split(".")[1]
-        names = [channel.rsplit(".", 1)[1] for channel in channels]
+        quantity, names = channels[0].split(".")[1], [channel.rsplit(".", 1)[1] for channel in channels]
         yield RosTopicTimeSeries(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
         return
     kind: Any = "vector" if begin.startswith("residual") else "point"
@@ -390,8 +389,7 @@ def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTop
 
 def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
     """Yield unknown forces, pushes, offsets and biases, at the start of each interval and the end of the last one."""
-    edges = np.array(group["edges"]) + float(group.attrs.get("start", 0.0))
-    mean = np.array(group["mean"])
+    edges, mean = np.array(group["edges"]) + float(group.attrs.get("start", 0.0)), np.array(group["mean"])
     if not len(mean):
         return
     held = np.vstack([mean, mean[-1:]])

@@ -35,6 +35,7 @@ _FLAGS = {
     "message_fields": "--field",
     "column_meanings": "--columns",
     "point_names": "--points",
+    "has_header": "--no-header",
 }  # options whose flag has another name
 _SWITCHES = {("has_header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
@@ -61,6 +62,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
             what, hint = "--clock-offset aligns several files, but there is only one", "leave --clock-offset out"
             raise ConfigError(what, where="--clock-offset", allowed="with two files or more", hint=hint)
         else:
+            _option_names_by_file(files, options)
             recording = read_third_party_recording(files[0], options, progress)
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
@@ -117,6 +119,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
             own = {name: value for name, value in options.items() if name != "file_clock_offsets"}
             recording = _merged(files, own, options.get("file_clock_offsets"), progress)
         else:
+            _option_names_by_file(files, options)
             recording = read_any(files[0], progress=progress, **options)
     except DataError as error:
         unknown = next((key for key, own in (options.get("column_meanings") or {}).items() if own == "skip"), "")
@@ -143,12 +146,7 @@ def _merged(
     files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
 ) -> Recording:
     """Return one recording from several files. An option applies to every file whose format has it."""
-    known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
-    for name in options:
-        if not any(name in own for own in known.values()):
-            what, hint = f"{_flag(name)} does not apply to files of these formats", f"leave {_flag(name)} out"
-            allowed = ", ".join(sorted(map(_flag, set().union(*known.values()))))
-            raise DataError(what, where=_flag(name), allowed=allowed or "no options", hint=hint)
+    known = _option_names_by_file(files, options)
     late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
     units = dict(options.get("units") or {})
     if units.get("effort") in base.MOTOR_CURRENT_UNITS:
@@ -171,9 +169,19 @@ def _merged(
     if len(set(stems)) < len(stems):
         what = f"two files have the name '{max(stems, key=stems.count)}', apart from folder and ending"
         raise DataError(what, where=", ".join(files), allowed="files with different names", hint="rename one of them")
-    parts = [replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)]
-    merged = merge_recordings(parts, offsets)
+    merged = merge_recordings([replace(part, name=stem) for part, stem in zip(parts, stems, strict=True)], offsets)
     return base.convert_to_si_and_validate(merged, ", ".join(files), base.JointPointAndUnitOptions(**late))
+
+
+def _option_names_by_file(files: Sequence[str], options: Mapping[str, Any]) -> Mapping[str, Sequence[str]]:
+    """Return the option names of each file's reader. Raises `DataError` if none of them has one of `options`."""
+    known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
+    for name in options:
+        if not any(name in own for own in known.values()):
+            what = f"{_flag(name)} does not apply to files of {'this format' if len(files) == 1 else 'these formats'}"
+            allowed = ", ".join(sorted(map(_flag, _KINDS.keys() & set().union(*known.values())))) or "no options"
+            raise DataError(what, where=_flag(name), allowed=allowed, hint=f"leave {_flag(name)} out")
+    return known
 
 
 def recording_summary_dict(recording: Recording) -> dict[str, Any]:

@@ -144,6 +144,8 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
                 lines.close()
             _clear(temporary, made)
             if isinstance(error, YidError):
+                key = tuple(error.where.split("."))
+                error.where = run.setting_location(*key) if key in run.key_locations else error.where
                 _name_requested_folder(error, target, temporary, partial)
             raise
 

@@ -62,7 +62,7 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
                 issues = [] if recording is None else data_quality_issues_of_recording(run, system, recording)
-                progress.begin_stage("estimating pose, depth and clock of the camera")
+                progress.begin_stage("finding what all images share: camera, clock and dimensions")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("fitting the object in every image")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
@@ -71,8 +71,10 @@ def _run_track(
                     found = tracker.track_result_from_frame_reports(frames, note, common)
                 except DataError as error:
                     refused = error
-        except YidError:
+        except YidError as error:
             tasks.delete_files()
+            if made is not None and str(folder.resume_folder) in error.where:  # rendered frames, which are not kept
+                error.where = run.setting_location("track", "virtual_frames")
             raise
         progress.begin_stage("drawing pictures")
         for frame in _drawn(frames, settings.n_drawn_frames):
@@ -100,7 +102,8 @@ def _run_track(
         tasks.delete_files()
     if refused is not None:
         hint = f"{refused.hint}. {folder.path} has pictures, and the reason for each frame"
-        raise DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
+        where = refused.where if made is None else run.setting_location("track", "virtual_frames")
+        raise DataError(refused.what, where=where, allowed=refused.allowed, hint=hint)
     return CommandOutcome(folder.path, written, None)
 
 
@@ -172,8 +175,7 @@ def _points(found: TrackResult) -> dict[str, Any]:
 def _truth_errors(
     system: System, found: TrackResult, made: VirtualFramesWithTruth
 ) -> Mapping[str, Mapping[str, float]]:
-    shape = ShapeFitter(system)
-    columns = [system.point_frames.index(name) for name in found.point_names]
+    shape, columns = ShapeFitter(system), [system.point_frames.index(name) for name in found.point_names]
     truth = np.array([shape.point_positions_at_configuration(made.true_configuration_at(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {

@@ -41,8 +41,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
         if name not in known:
             what, hint = f"the reader of '{known_as}' files has no option '{name}'", f"leave the option '{name}' out"
             raise DataError(what, where=str(path), **unknown_name_error_arguments(name, known, hint))
-    given = {"options": replace(default, **options)} if default else options
-    return reader(path, **given, **_told(reader, progress))
+    return reader(path, **({"options": replace(default, **options)} if default else options), **_told(reader, progress))
 
 
 def reader_option_names_for_file(path: str | os.PathLike[str]) -> list[str]:

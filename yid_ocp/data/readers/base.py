@@ -144,18 +144,19 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     Raises `DataError` for an unknown joint, point, quantity or unit, for a current without torque constants, or if
     `validated_recording` refuses the result.
     """
-    factors = factor_to_si_by_quantity(options.units or {}, where)
-    group = raw.joints
+    factors, group = factor_to_si_by_quantity(options.units or {}, where), raw.joints
     if group is not None:
         names = {name: name for name in group.names}
         if options.joints is not None:
             names = parse_old_to_new_joint_names(options.joints, where)
             require_known_names(names, group.names, "joint", where, DataError)
-        at = [group.names.index(name) for name in names]
-        recorded = group.values_by_channel.items()
+        at, recorded = [group.names.index(name) for name in names], group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
+        elif options.torque_constants or options.gear_ratios:
+            what, allowed = "torque constants or gear ratios are given, but there are no efforts", "both with efforts"
+            raise DataError(what, where=where, allowed=allowed, hint="leave them out, or give the efforts")
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen, chosen = list[PointGroup](), options.point_names
     for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):
@@ -192,13 +193,13 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
 def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, where: str) -> Array:
     """Factors from recorded efforts to joint torques, [N m] per recorded unit, shape (nj,)."""
     constants, gear_ratios = options.torque_constants or {}, options.gear_ratios or {}
-    for word, given in (("torque_constants", constants), ("gear_ratios", gear_ratios)):
+    for word, given in (("torque constant", constants), ("gear ratio", gear_ratios)):
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
-                what = f"{word} has a value for '{pattern}', but no joint has this name"
+                what = f"a {word} is given for '{pattern}', but no joint has this name"
                 raise DataError(what, where=where, **unknown_name_error_arguments(pattern, names))
             if not (math.isfinite(value) and value != 0):
-                what, allowed = f"{word} of '{pattern}' is {value:g}", "a finite number that is not zero"
+                what, allowed = f"the {word} of '{pattern}' is {value:g}", "a finite number that is not zero"
                 raise DataError(what, where=where, allowed=allowed, hint=f"write for example {pattern}=0.1")
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
@@ -279,10 +280,8 @@ def joints_on_fastest_clock(
 
 def _can_interpolate(known: Array, t: Array) -> BoolArray:
     """Mask of the times `t` that are in `known` or lie between two times of `known` that are near enough together."""
-    after = np.searchsorted(known, t)
-    before = np.searchsorted(known, t, side="right") - 1
-    inside = (after < len(known)) & (before >= 0)
-    period = median_sample_period(known)
+    after, before = np.searchsorted(known, t), np.searchsorted(known, t, side="right") - 1
+    inside, period = (after < len(known)) & (before >= 0), median_sample_period(known)
     gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(before, 0)]
     return np.asarray(inside & (gap <= _MAX_INTERPOLATED_PERIODS * period + 1e-12))
 

@@ -85,8 +85,7 @@ def _read_lerobot_episode(
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
     where = f"{dataset.folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
-        why = f"{_PERCENT}, so state a fixed angle in model.arms.locked_joints"
-        left |= dict.fromkeys(_grippers(names), why)
+        left |= dict.fromkeys(_grippers(names), f"{_PERCENT}, so state a fixed angle in model.arms.locked_joints")
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
     group = JointGroup(names, t - t[0], clock="nominal", **channels)
