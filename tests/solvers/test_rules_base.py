@@ -85,7 +85,7 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried,
     solution = fit_problem(MadeUp(misfit(chi2_at.get)), solver, callback=told.append)
     assert starts(solver) == [[x] for x in tried]
     assert (solution.x.tolist(), solution.message) == ([kept], message)
-    notes = [f"start {n} of at most 4: initial values x {x:g}" for n, x in enumerate(tried[1:], 2)]
+    notes = [f"start {n} of at most 4: initial values times {x:g}" for n, x in enumerate(tried[1:], 2)]
     assert [entry.note for entry in solution.history] == [entry.note for entry in told] == ["", *notes]
     assert (solution.n_evaluations, solution.n_iterations) == (len(tried), len(tried) - 1)
 

@@ -214,7 +214,8 @@ def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError("the text is not JSON", where=where, allowed=allowed, hint="correct or delete it") from error
+        what, hint = "the attribute is not JSON", "correct or delete it"
+        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]

@@ -77,9 +77,11 @@ class SimulationOptions:
             raise ConfigError(what, where="time_step", allowed=allowed, hint=hint)
         require_known_names([self.effort_kind], get_args(EffortSamplingKind), "kind", "effort_kind", ConfigError)
         if self.effort_kind == "command" and periods > 1:
-            what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
+            what = f"the controller ({controller:g} Hz) changes commands within a sample ({self.sample_rate:g} Hz), so "
+            what += "effort_kind='command' (the default) has no single value per sample"
             allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
-            raise ConfigError(what, where="effort_kind", allowed=allowed, hint="pass effort_kind='mean'")
+            hint = "pass effort_kind='mean' for the mean effort of each sample"
+            raise ConfigError(what, where="effort_kind", allowed=allowed, hint=hint)
 
     @property
     def _controller_rate(self) -> float:
