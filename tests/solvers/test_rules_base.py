@@ -377,7 +377,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     assert (solution.x.tolist(), solution.goodness_of_fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
     notes = {entry.note for entry in solution.history}
-    assert notes == {"", "weighting 2 of at most 16", "start 2 of at most 3: best fit x 1.25"}
+    assert notes == {"", "weighting 2 of at most 16", "start 2 of at most 3: best fit times 1.25"}
     poor = Carrying(there, [[2.5], [2.1]], [[3.2], [2.2]])
     solution = fit_problem(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message

@@ -186,8 +186,7 @@ def _descent_errors(
         why = f"It ended too early ({run.solution.status.value})"
     elif all(is_far(best, name) for name in seen):
         why = "Unlike `yid-ocp solve`, the methods here ignore noise of the torques or angles that move the model"
-    said = f"Do not use the values of {run.method} that the recordings determine, but that are far from the truth"
-    return f"{said}: {places}. {why}"
+    return f"Do not use {run.method} here: it gives {places}, although the recordings determine this. {why}"
 
 
 class _Memory:

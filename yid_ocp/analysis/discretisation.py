@@ -70,12 +70,7 @@ class _FinerModel:
     def _unknowns(self, names: Sequence[str], x: Array) -> Array:
         """Return the fine unknowns for coarse unknowns `x`, within bounds."""
         slopes = self._slopes(names)
-        made = np.where(slopes.any(axis=1), slopes @ x, self.problem.initial_unknowns)
-        return np.clip(made, *self.problem.bounds)
-
-    def _coarse_unknowns(self, names: Sequence[str], x: Array, fine: Array) -> Array:
-        """Return `x` with the values that fine unknowns have in the coarse model."""
-        return x + np.linalg.lstsq(slopes := self._slopes(names), fine - slopes @ x, rcond=None)[0]
+        return np.clip(np.where(slopes.any(axis=1), slopes @ x, self.problem.initial_unknowns), *self.problem.bounds)
 
     def _guess(self, coarse: System, q: Array) -> Array:
         tree = self.problem.system.mechanism
@@ -208,7 +203,8 @@ def problem_data_corrected_for_few_links(
         for is_refitted in (False, True):
             if is_refitted:
                 point = GaussNewton(max_iterations=_MAX_FINER_FIT_ITERATIONS).minimize_cost(finer, point, None).x
-                x = refined._coarse_unknowns(fitted.unknown_names, x, point)
+                slopes = refined._slopes(fitted.unknown_names)
+                x = x + np.linalg.lstsq(slopes, point - slopes @ x, rcond=None)[0]
             fine, coarse = finer.evaluate(point, False, warm), fitted.evaluate(x, False, guesses)
             if not (fine.ok and coarse.ok):
                 return None

@@ -214,8 +214,7 @@ def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        what, hint = "the attribute is not JSON", "correct or delete it"
-        raise DataError(what, where=where, allowed=allowed, hint=hint) from error
+        raise DataError("the attribute is not JSON", where=where, allowed=allowed, hint="correct it") from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]

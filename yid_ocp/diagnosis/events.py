@@ -201,8 +201,7 @@ def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: In
     joints = episode.recording.joints
     # the time of a torque is known to one sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    error = np.hypot(_INVERSE_DYNAMICS_RTOL * terms.rss_torque, late * terms.torque_rate)
-    return error, terms.static_friction_limit
+    return np.hypot(_INVERSE_DYNAMICS_RTOL * terms.rss_torque, late * terms.torque_rate), terms.static_friction_limit
 
 
 def _read_forces(

@@ -266,8 +266,7 @@ def _ranked_families(composed: AllCandidatesProblem, before: RefittedModel, laws
         families += [*single, *(own for own in both if own.log_evidence > max(one.log_evidence for one in single))]
     families.sort(key=lambda family: -family.log_evidence)
     over_time = [family for family in families if family.law.quantities == ("time",)]
-    rest = [family for family in families if family.law.quantities != ("time",)]
-    return [*rest[: _MAX_REFITS - 1], *over_time[:1]]
+    return [*[family for family in families if family.law.quantities != ("time",)][: _MAX_REFITS - 1], *over_time[:1]]
 
 
 def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
@@ -309,8 +308,7 @@ def _refitted(
     """Return a refit of the model with a law, whose values at the knots have a prior. None if it fails."""
     known = composed.problem.options.multivariate_prior
     names = (*known.parameter_names, *family.law.parameters.names)
-    covariance = scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision))
-    prior = MultivariateGaussianPrior(names, covariance)
+    prior = MultivariateGaussianPrior(names, scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision)))
     with_prior = replace(composed, problem=composed.problem.with_replaced_multivariate_prior(prior))
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)
     return refit_with_effects(with_prior, effects, {**before.values, **family.values}, limits=search.thresholds)

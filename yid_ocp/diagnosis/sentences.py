@@ -253,8 +253,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    change = _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)
-    return [said, change]
+    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:

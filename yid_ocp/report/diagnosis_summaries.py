@@ -130,7 +130,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
     if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
-        do = "are confirmed within the intervals" if near == len(stated) else "are not reliable, so do not use them"
+        do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
         where = f"the 95 % interval contains the stated probability in {near} of {len(stated)} groups of cases"
         said.append(f"The probabilities of the diagnosis {do}: {where}.")
     yield from (SummaryStatement(text, "verdict") for text in said)

@@ -551,7 +551,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
-    yield SummaryStatement(said if lost else "The file has all parts of the run's model.", "conclusion")
+    yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
     yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
     gate = manifest["gate"]
     if gate is None:

@@ -249,8 +249,7 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
     if camera.has_dropouts:
         number = max(1, round(duration / 2.5))
         starts = duration / number * (np.arange(number) + rng.uniform(0.15, 0.45, number))
-        lengths = rng.uniform(1.0, 1.5, number)
-        times = times[~((times[:, None] >= starts) & (times[:, None] <= starts + lengths)).any(1)]
+        times = times[~((times[:, None] >= starts) & (times[:, None] <= starts + rng.uniform(1.0, 1.5, number))).any(1)]
     return np.asarray(times)
 
 

@@ -450,8 +450,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
-            exact = "" if emulate else "exact "
-            what = f"MuJoCo has no {exact}term for a compliant grasp of the kind {grasp.kind}"
+            what = f"MuJoCo has no {'exact ' * (not emulate)}term for a compliant grasp of the kind {grasp.kind}"
             hint = f"leave out the effect grasp_compliance@{grasp.name}"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():

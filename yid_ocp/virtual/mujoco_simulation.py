@@ -79,9 +79,8 @@ class SimulationOptions:
         if self.effort_kind == "command" and periods > 1:
             what = f"the controller ({controller:g} Hz) changes commands within a sample ({self.sample_rate:g} Hz), so "
             what += "effort_kind='command' (the default) has no single value per sample"
-            allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
-            hint = "pass effort_kind='mean' for the mean effort of each sample"
-            raise ConfigError(what, where="effort_kind", allowed=allowed, hint=hint)
+            allowed = f"sample, or mean (of each sample); command with controller_rate = {self.sample_rate:g} Hz"
+            raise ConfigError(what, where="effort_kind", allowed=allowed, hint="pass effort_kind='mean'")
 
     @property
     def _controller_rate(self) -> float:

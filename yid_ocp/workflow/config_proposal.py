@@ -391,9 +391,6 @@ def _parts_when_straight(positions: Array, poses: Array, branches: Sequence[Flex
     return np.array([np.mean(own[np.isfinite(own)]) if np.isfinite(own).any() else math.nan for own in ratio.T])
 
 
-_ELSEWHERE = "so it is probably not on the object, or not in the world frame"
-
-
 def _near(
     poses: Array, position: Array, part_when_straight: float, branches: Sequence[FlexibleSegment], holder: str
 ) -> tuple[str, str]:
@@ -408,7 +405,10 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} object lengths away from {holder}, {_ELSEWHERE}"
+            return (
+                "",
+                f"it is {part:.1f} object lengths away from {holder}. Is it on the object, and in the world frame?",
+            )
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
@@ -419,7 +419,7 @@ def _near(
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
     if apart[name] > 0.5 * max(branch.length for branch in branches):
-        return "", f"it is {apart[name]:.2g} m away from the straight object, {_ELSEWHERE}"
+        return "", f"it is {apart[name]:.2g} m away from the straight object. Is it in the world frame?"
     return name, f"it is {1e3 * apart[name]:.0f} mm from this frame when the object is straight"
 
 

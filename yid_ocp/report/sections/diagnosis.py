@@ -72,7 +72,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     if changed:
         names = ", ".join(effect.label for effect in finding.accepted_effects)
         is_left = finding.remaining_test.p_value < finding.thresholds.significance_level
-        rest = "Predictions still err by more than noise" if is_left else "Noise explains what remains of the error"
+        rest = "Predictions still err by more than noise" if is_left else "Noise and the ± explain what remains"
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
         change = f"goes from {first:.3g} to {last:.3g} (noise alone gives 1)"
         sentences.append(f"{rest}: with {names}, chi² per degree of freedom of held-out recordings {change}.")
