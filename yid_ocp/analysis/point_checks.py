@@ -69,8 +69,7 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
         if not frames or inside.sum() < 3:
             continue
         rows = np.flatnonzero(inside)[:: max(1, int(inside.sum()) // 200)]
-        columns = [group.names.index(name) for name in frames]
-        seen, t = group.position[rows][:, columns], group.t[rows]
+        seen, t = group.position[rows][:, [group.names.index(name) for name in frames]], group.t[rows]
         angles = joints.position[:, [joints.names.index(name) for name in arm.joint_names]]
         course, places = scipy.interpolate.CubicSpline(joints.t, angles, axis=0), tuple(frames.values())
         place, by_angle = arm.frame_positions_and_jacobians(places, course(t))

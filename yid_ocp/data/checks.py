@@ -232,8 +232,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     names = joints.names
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
     for j, (x, y) in enumerate(zip(by_velocity.T, by_angle.T, strict=True)):
-        floor = max(0.02, 2 * channel_checks.white_noise_std(joints.t, joints.velocity[:, j]))
-        if np.std(x) > floor and np.std(y) > 0:
+        if np.std(x) > max(0.02, 2 * channel_checks.white_noise_std(joints.t, joints.velocity[:, j])) and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])
     known = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) > 0.8]
@@ -266,8 +265,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
     """Find pairs of exchanged joints: the angle of each joint changes like the recorded velocity of the other one."""
-    off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
-    for i, j in combinations(off, 2):
+    for i, j in combinations([j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5], 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
         if min(across) > 0.9:
             own = max(abs(fit[i]), abs(fit[j]), 1e-3)

@@ -131,8 +131,7 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
         do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
-        where = f"the 95 % interval contains the stated probability in {near} of {len(stated)} groups of cases"
-        said.append(f"The probabilities of the diagnosis {do}: {where}.")
+        said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
     yield from (SummaryStatement(text, "verdict") for text in said)
     yield replace(score, is_key_table=True)
     yield from others

@@ -413,8 +413,7 @@ def replay_mismatch_by_channel(
     `DataError` if MuJoCo is not installed.
     """
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
-    moved = system.driven or system.prescribed
-    joints = recording.joints
+    moved, joints = system.driven or system.prescribed, recording.joints
     missing = set(moved).difference(() if joints is None else joints.names)
     if joints is None or missing or not moved:
         names = f"{', '.join(sorted(missing)) or 'a joint'}, of the {len(moved)} joints that are driven or prescribed"

@@ -309,8 +309,7 @@ def _speeds(t: Array, values: Array, time: float) -> tuple[Array, Array]:
     """Return the absolute slope of each channel's line over a window, and its std; zeros for fewer than 4 samples."""
     # the first five frames of a slow camera do not show whether its points started at rest
     window = float(np.clip(5 * (median_sample_period(t) or math.inf), _REST_WINDOW, 2 * _REST_WINDOW))
-    rows = (t >= time - 1e-9) & (t <= time + window)
-    zeros = np.zeros(values.shape[1])
+    rows, zeros = (t >= time - 1e-9) & (t <= time + window), np.zeros(values.shape[1])
     if rows.sum() < 4:
         return zeros, zeros
     centred = t[rows] - t[rows].mean()
@@ -407,7 +406,7 @@ def _near(
         if part > 1.2:
             return (
                 "",
-                f"it is {part:.1f} object lengths away from {holder}. Is it on the object, and in the world frame?",
+                f"it is {part:.1f} object lengths away from {holder}. Is it on the object, in the world frame?",
             )
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
