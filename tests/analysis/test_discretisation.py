@@ -444,7 +444,7 @@ def test_a_search_that_converged_at_an_unstable_time_step_has_stalled(light, lig
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
-        assert judged.message.startswith("the simulation is unstable at the estimate, because the time step of 0.005 s ")
+        assert judged.message.startswith("the simulation is unstable at the estimate, because the time step of 0.005 s")
         assert found.message in judged.message
     else:
         entry = found.parameters["cable.bend"]

@@ -407,8 +407,7 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     evaluation = problem.evaluate(x, False, view.evaluation.equilibrium_guesses)
     if not evaluation.ok:
         return math.inf
-    rows = problem.residual_rows.data
-    change = np.zeros((len(view.nuisance), 1))
+    rows, change = problem.residual_rows.data, np.zeros((len(view.nuisance), 1))
     moved = evaluation.residual[rows] - view.evaluation.residual[rows]
     change[rows, 0] = moved / problem.stated_rms_noise_of_data_residuals
     return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation

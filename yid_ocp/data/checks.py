@@ -217,8 +217,7 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
     width = max(3, round(0.2 / max(median_sample_period(t), 1e-9)))
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
-    length = (t[ends] - t[starts])[:, None]
-    area = cumulative_trapezoid(rates, t, axis=0, initial=0)
+    length, area = (t[ends] - t[starts])[:, None], cumulative_trapezoid(rates, t, axis=0, initial=0)
     good = (length[:, 0] > 0) & (length[:, 0] < 3 * np.median(length))
     by_value, by_rate = ((x[ends] - x[starts])[good] / length[good] for x in (values, area))
     return by_value, by_rate

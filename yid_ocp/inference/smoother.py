@@ -97,7 +97,8 @@ class SmoothedUnknownsResult:
         """The origin of the gap: "none", "plant", "sensor", "both", or "either" if the data cannot distinguish them."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
-        if max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source]).is_confounded_with_bias:
+        heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
+        if heaviest.is_confounded_with_bias:
             return "either"
         # both must exceed either alone by more than chance
         alone = max(("plant", "sensor"), key=lambda name: self.log_evidence[name])
