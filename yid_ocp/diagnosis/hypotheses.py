@@ -85,12 +85,13 @@ def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> 
 
     Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again.
     """
-    where = "diagnosis.excluded_candidates"
-    known = dict.fromkeys([*(effect.kind for effect in effects), *(effect.label for effect in effects)])
+    where, kinds = "diagnosis.excluded_candidates", (effect.kind for effect in effects)
+    known = dict.fromkeys([*kinds, *(effect.label for effect in effects)])
     frictions = dict.fromkeys(effect.kind for effect in effects if effect.is_joint_friction)
     for name in names:
         if name not in known:
-            said = unknown_name_error_arguments(name, known, "remove it from the list")
+            alike = (entry for entry in known if ("@" in entry) == ("@" in name))
+            said = unknown_name_error_arguments(name, alike, "remove it from the list")
             said |= {"hint": f"list {', '.join(frictions)}"} if "friction" in name and frictions else {}
             raise ConfigError(f"this diagnosis has no candidate '{name}'", where=where, **said)
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]

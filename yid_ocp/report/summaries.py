@@ -251,7 +251,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryTable(rows, "What another experiment would identify")
         yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)."
+    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     text = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}." if lost else ""

@@ -134,8 +134,7 @@ def run_virtual_experiment(
     `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`.
     """
     chosen = experiment or VirtualExperimentSettings()
-    duration = chosen.simulation.duration
-    posture = chosen.initial_joint_angles
+    duration, posture = chosen.simulation.duration, chosen.initial_joint_angles
     posture = joint_motion.grasping_joint_angles(system, values) if posture is None else posture
     excitation = joint_motion.MultisineOptions(duration=duration)
     motion = chosen.motion or joint_motion.random_multisine_motion(
