@@ -158,7 +158,7 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
     assert tried == {"joint_coulomb@shoulder", "link_mass@elbow"}
     assert "joint_coulomb@elbow.tau_c" in finding.nominal_model.problem.system.parameters.names
     assert "joint_coulomb@elbow" not in {effect.label for effect in finding.accepted_effects}
-    for name, said in (("joint_viscous", "is not a candidate"), ("joint_coulomb@tail", "is not a candidate")):
+    for name, said in (("joint_viscous", "no candidate 'joint_viscous'"), ("joint_friction", "list joint_coulomb")):
         with pytest.raises(YidError, match=said):
             diagnose(problem, FRICTION, recordings[1:], exclude=[name])
     with pytest.raises(YidError, match="candidates are excluded"):

@@ -241,7 +241,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     assert "The error of joints.effort.elbow changes most" in text
     assert "Of the error beyond noise that can be located, " in text
     assert "would have been detected" in text
-    assert "Most probably the gap of the nominal model comes from the mechanics or the effort sensor, which" in text
+    assert "Most probably the gap of the nominal model comes from the mechanics or the effort sensor (rec" in text
     assert "The best are joint_coulomb@elbow" in text
     assert "No two signatures are similar in both directions" in text
     assert "The most significant value is that of elbow" in text

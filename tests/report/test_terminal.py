@@ -164,16 +164,16 @@ def test_an_interval_is_shown_of_every_number_that_is_known():
 def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
-    finer = {"links": "model.object.links: 8"}
-    lines = told("yid-solve/1", solved(discretisation=moved, discretisation_notes=["it snaps"], finer_settings=finer))
+    more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
+    lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
     rest = "With half the time step, no estimate would change by more than its ± from the recordings."
     assert lines.index("it snaps") < (at := lines.index(said))
-    assert lines[at + 1 : at + 3] == ["-5.5 (± 0.073). To cure this, set model.object.links: 8.", rest]
-    own = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
-    lines = told("yid-solve/1", solved(discretisation=own))
-    assert "This assumes that the noise is as stated (sensors.joints.position.std)," in " ".join(lines)
-    assert not any("twice the links" in line for line in lines)
+    told_next = "-5.5 (± 0.073). The ± of the table includes this. To cure this, set model.object.links: 8, and solve"
+    assert lines[at + 1 : at + 4] == [told_next, "again.", rest]
+    noisy = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
+    ends = [" ".join(told("yid-solve/1", solved(discretisation=noisy, status=s))) for s in ("converged", "stalled")]
+    assert [("This assumes that the noise is as" in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]
 
 
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
@@ -204,14 +204,14 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
-    base = {"words": "as it is", "identifiable": 0, "gain": None, "message": ""}
+    base = {"words": "the experiment as it is", "identifiable": 0, "gain": None, "message": ""}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
     assert "No set of up to three changes makes it possible to find all parameters." in lines
     assert "None of 1 parameters can be found" in lines[-1]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
-    assert "changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)[-2]
+    assert "The fewest changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():

@@ -85,7 +85,7 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried,
     solution = fit_problem(MadeUp(misfit(chi2_at.get)), solver, callback=told.append)
     assert starts(solver) == [[x] for x in tried]
     assert (solution.x.tolist(), solution.message) == ([kept], message)
-    notes = [f"start {n} of at most 4: initial values x {x:g}" for n, x in enumerate(tried[1:], 2)]
+    notes = [f"start {n} of at most 4: initial values times {x:g}" for n, x in enumerate(tried[1:], 2)]
     assert [entry.note for entry in solution.history] == [entry.note for entry in told] == ["", *notes]
     assert (solution.n_evaluations, solution.n_iterations) == (len(tried), len(tried) - 1)
 
@@ -377,7 +377,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     assert (solution.x.tolist(), solution.goodness_of_fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
     notes = {entry.note for entry in solution.history}
-    assert notes == {"", "weighting 2 of at most 16", "start 2 of at most 3: best fit x 1.25"}
+    assert notes == {"", "weighting 2 of at most 16", "start 2 of at most 3: best fit times 1.25"}
     poor = Carrying(there, [[2.5], [2.1]], [[3.2], [2.2]])
     solution = fit_problem(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message

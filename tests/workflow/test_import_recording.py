@@ -177,7 +177,7 @@ def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
     told = printed("init", "package:xarm7", "run.h5", "--out", "run.yaml")
     assert "joints: joint1..7\n" in told
     for text in (told, (odd / "run.yaml").read_text()):
-        assert "m1..3, m5, tip to no frame" in text
+        assert "`init` leaves out recorded m1..3, m5, tip, because" in text
 
 
 def test_no_command_is_suggested_that_would_fail(odd, printed):

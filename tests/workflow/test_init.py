@@ -501,7 +501,7 @@ def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.Captur
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert "Check the frame of its positions" in capsys.readouterr().out
+    assert " in the world frame?" in capsys.readouterr().out
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2

@@ -152,11 +152,12 @@ def _explanations(
 ) -> list[str]:
     runs, sentences = [run for run in runs if run.has_values], []
     for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
-        known = f" (truth {truth[name]:g})" if name in truth else ""
+        known = f" (truth {truth[name]:g} {reference.unit})" if name in truth else ""
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         is_lost = reference.verdict == "not_identifiable"
-        ends = "no value is shown, because the data do not determine it" if is_lost else f"methods may differ: {places}"
-        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}; {ends}")
+        ends = "; no value is shown, because the data do not determine it"
+        ends = ends if is_lost else f". Do not rely on one method's value in {reference.unit}: {places}"
+        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}{ends}")
     descents = [run for run in runs if run.method == "steepest_descent" and truth]
     return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
 
@@ -180,12 +181,12 @@ def _descent_errors(
         return f"{said}, and no value of these counts as found"
     own = [(name, run.solution.parameters[name]) for name in seen]
     places = ", ".join(f"{name} = {entry.value:.3g} {entry.unit} (true {truth[name]:.3g})" for name, entry in own)
-    why = "its cost weights the measurements differently"
+    why = "Its cost weights the measurements differently"
     if run.solution.status != Status.CONVERGED:
-        why = f"it ended too early ({run.solution.status.value})"
+        why = f"It ended too early ({run.solution.status.value})"
     elif all(is_far(best, name) for name in seen):
-        why = "like all methods except `solve`, it ignores noise of the torques or angles that move the model"
-    return f"{run.method} gives {places}, although the recordings determine this, because {why}"
+        why = "Unlike `yid-ocp solve`, the methods here ignore noise of the torques or angles that move the model"
+    return f"Do not use {run.method} here: it gives {places}, although the recordings determine this. {why}"
 
 
 class _Memory:

@@ -150,14 +150,15 @@ def _checked_solution_and_step_stability(
     """Return the solution, marked as stalled if the time step is unstable, and stability data for result.json."""
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
-    end = growth(problem, solution.x)
+    end, unstable = growth(problem, solution.x), "the simulation is unstable at the"
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
-        message = f"at the estimate {end.stability_message}. Solver: {solution.message}"
+        message = f"{unstable} estimate, because {end.stability_message}. Solver: {solution.message}"
         return replace(solution, status=status, message=message), found
     if solution.status == Status.FAILED and begin is not None and not begin.keeps_errors_below_resolution:
-        return replace(solution, message=f"at the start {begin.stability_message}. Solver: {solution.message}"), found
+        message = f"{unstable} start, because {begin.stability_message}. Solver: {solution.message}"
+        return replace(solution, message=message), found
     return solution, found
 
 

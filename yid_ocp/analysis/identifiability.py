@@ -395,8 +395,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     start = f"another initial state. {rest}", "start."
     for words, prefix in (start, (f"another position of the grasp. {grasp}", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-        remaining = np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at]))
-        if remaining * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
+        if np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at])) * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0:
             return words
     return f"another initial state and position of the grasp. {rest}. {grasp}" if places else f"other unknowns. {rest}"
 
@@ -408,8 +407,7 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     evaluation = problem.evaluate(x, False, view.evaluation.equilibrium_guesses)
     if not evaluation.ok:
         return math.inf
-    rows = problem.residual_rows.data
-    change = np.zeros((len(view.nuisance), 1))
+    rows, change = problem.residual_rows.data, np.zeros((len(view.nuisance), 1))
     moved = evaluation.residual[rows] - view.evaluation.residual[rows]
     change[rows, 0] = moved / problem.stated_rms_noise_of_data_residuals
     return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation

@@ -138,8 +138,7 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
             fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
             # gravity forces do not depend on the inertia about the centre of mass
             place, tensor = _number(body.center_of_mass).ravel(), _number(body.inertia_about_com)
-            inertia = pin.Inertia(float(body.mass) * fraction, place, tensor)
-            model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
+            model.appendBodyToJoint(index, pin.Inertia(float(body.mass) * fraction, place, tensor), pin.SE3.Identity())
     return model
 
 

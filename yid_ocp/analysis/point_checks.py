@@ -69,13 +69,11 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
         if not frames or inside.sum() < 3:
             continue
         rows = np.flatnonzero(inside)[:: max(1, int(inside.sum()) // 200)]
-        columns = [group.names.index(name) for name in frames]
-        seen, t = group.position[rows][:, columns], group.t[rows]
+        seen, t = group.position[rows][:, [group.names.index(name) for name in frames]], group.t[rows]
         angles = joints.position[:, [joints.names.index(name) for name in arm.joint_names]]
         course, places = scipy.interpolate.CubicSpline(joints.t, angles, axis=0), tuple(frames.values())
         place, by_angle = arm.frame_positions_and_jacobians(places, course(t))
-        error = _rms(seen - place)
-        noise = _noise(group)
+        error, noise = _rms(seen - place), _noise(group)
         knots = float(joints.t[0]), float(joints.t[-1])
         dense = np.linspace(*knots, int(np.clip(_PATH_SAMPLE_RATE * (knots[1] - knots[0]), 400, 20_000)))
         path = scipy.interpolate.CubicSpline(dense, arm.frame_positions_and_jacobians(places, course(dense))[0], axis=0)

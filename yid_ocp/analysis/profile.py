@@ -299,8 +299,7 @@ class _Walk:
                 break
             jacobian = found.jacobian[:, others]
             step = self._others_step(now, jacobian, found.rows, damping)
-            largest = float(np.max(np.abs(step[self.positive[others]]), initial=0.0))
-            step *= min(1.0, 1.5 / max(largest, 1e-300))
+            step *= min(1.0, 1.5 / max(float(np.max(np.abs(step[self.positive[others]]), initial=0.0)), 1e-300))
             promised = -2.0 * float(found.rows @ (jacobian @ step)) - float(np.sum((jacobian @ step) ** 2))
             if promised / self.scale < _REFIT_CHI2_ATOL:
                 break

@@ -170,7 +170,7 @@ def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedEx
 
 
 def _words(changes: Sequence[ExperimentChange]) -> str:
-    return "; ".join(change.description for change in changes) or "as it is"
+    return " + ".join(change.description for change in changes) or "the experiment as it is"
 
 
 class _Outcomes:
@@ -268,8 +268,7 @@ def _relative_stds_and_gain(layout: VariantPositionSensitivities, information: A
     """Return the relative std of every free parameter, and the gain [nat], from the information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])
-    others = np.setdiff1d(np.arange(len(x)), chosen)
-    scale = problem.unknown_scales.copy()
+    others, scale = np.setdiff1d(np.arange(len(x)), chosen), problem.unknown_scales.copy()
     scale[chosen] = np.where(x[chosen] != 0, np.abs(x[chosen]), scale[chosen])
     scaled = information * np.outer(scale, scale)
     own, cross = scaled[np.ix_(chosen, chosen)], scaled[np.ix_(chosen, others)]

@@ -217,8 +217,7 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
     width = max(3, round(0.2 / max(median_sample_period(t), 1e-9)))
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
-    length = (t[ends] - t[starts])[:, None]
-    area = cumulative_trapezoid(rates, t, axis=0, initial=0)
+    length, area = (t[ends] - t[starts])[:, None], cumulative_trapezoid(rates, t, axis=0, initial=0)
     good = (length[:, 0] > 0) & (length[:, 0] < 3 * np.median(length))
     by_value, by_rate = ((x[ends] - x[starts])[good] / length[good] for x in (values, area))
     return by_value, by_rate
@@ -232,8 +231,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     names = joints.names
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
     for j, (x, y) in enumerate(zip(by_velocity.T, by_angle.T, strict=True)):
-        floor = max(0.02, 2 * channel_checks.white_noise_std(joints.t, joints.velocity[:, j]))
-        if np.std(x) > floor and np.std(y) > 0:
+        if np.std(x) > max(0.02, 2 * channel_checks.white_noise_std(joints.t, joints.velocity[:, j])) and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])
     known = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) > 0.8]
@@ -266,8 +264,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
     """Find pairs of exchanged joints: the angle of each joint changes like the recorded velocity of the other one."""
-    off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
-    for i, j in combinations(off, 2):
+    for i, j in combinations([j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5], 2):
         across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
         if min(across) > 0.9:
             own = max(abs(fit[i]), abs(fit[j]), 1e-3)

@@ -214,7 +214,7 @@ def _json(text: str, where: str, allowed: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError("the text is not JSON", where=where, allowed=allowed, hint="correct or delete it") from error
+        raise DataError("the attribute is not JSON", where=where, allowed=allowed, hint="correct it") from error
 
 
 _READ_TIMEOUT = 10.0  # for reading a whole file [s]

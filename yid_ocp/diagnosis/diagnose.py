@@ -295,10 +295,11 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     refitted = refit_with_effects(problem, fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
-    search.progress.begin_stage("starting again without the error of too few links, because twice the links lower chi2")
+    gain = 2 * (fit.cost - refitted.cost)
+    said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
+    search.progress.begin_stage(said)
     search = search.restarted_with(problem)
-    nominal = _fitted_nominal_model(search, refitted.values)
-    return _examined(search, nominal, seen.truncated, True, seen.removed + 2 * (fit.cost - refitted.cost))
+    return _examined(search, _fitted_nominal_model(search, refitted.values), seen.truncated, True, seen.removed + gain)
 
 
 def _followed(

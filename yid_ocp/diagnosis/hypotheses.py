@@ -14,7 +14,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import Progress
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects.friction import lower_smoothing_speed_to_joint_min
-from yid_ocp.errors import ConfigError, DataError, SolverError, nearest_name_question
+from yid_ocp.errors import ConfigError, DataError, SolverError, unknown_name_error_arguments
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
@@ -85,13 +85,15 @@ def _exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> 
 
     Excluded candidates stay in the compiled step at their neutral values, so that it is not compiled again.
     """
-    where = "diagnosis.excluded_candidates"
-    known = {name for effect in effects for name in (effect.kind, effect.label)}
+    where, kinds = "diagnosis.excluded_candidates", (effect.kind for effect in effects)
+    known = dict.fromkeys([*kinds, *(effect.label for effect in effects)])
+    frictions = dict.fromkeys(effect.kind for effect in effects if effect.is_joint_friction)
     for name in names:
         if name not in known:
-            allowed = ", ".join(dict.fromkeys(effect.kind for effect in effects))
-            what, hint = f"'{name}' is not a candidate", nearest_name_question(name, known) or "remove it from the list"
-            raise ConfigError(what, where=where, allowed=f"{allowed}, or kind@location", hint=hint)
+            alike = (entry for entry in known if ("@" in entry) == ("@" in name))
+            said = unknown_name_error_arguments(name, alike, "remove it from the list")
+            said |= {"hint": f"list {', '.join(frictions)}"} if "friction" in name and frictions else {}
+            raise ConfigError(f"this diagnosis has no candidate '{name}'", where=where, **said)
     kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
     if not kept:
         what, allowed = f"all {len(effects)} candidates are excluded", f"at most {len(effects) - 1} excluded candidates"

@@ -317,7 +317,8 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     if not _is_needed(without, full, limits):
         search.progress.begin_stage(f"removed {label}, because the other effects explain as much without it")
         return replace(chosen, fit=without)
-    search.progress.begin_stage(f"looking for effects in place of {label}", 3.0, 13.0)
+    now = f"{full.held_out_loss.chi2_per_sample:.4g}"
+    search.progress.begin_stage(f"trying other effects in place of {label} (held-out chi2/n with it: {now})", 3.0, 13.0)
     company = f"in place of {label}"
     screened = search.screen(rest, without.values, f"beside {join_effect_labels(rest)} {company}")
     best = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]

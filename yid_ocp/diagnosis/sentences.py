@@ -28,7 +28,7 @@ _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locatio
 GAP_ORIGIN_TEXTS = {
     "plant": "the mechanics, not a sensor",
     "sensor": "a sensor, not the mechanics",
-    "either": "the mechanics or the effort sensor, which efforts alone cannot distinguish",
+    "either": "the mechanics or the effort sensor (recorded efforts alone do not show which)",
     "both": "both the mechanics and a sensor",
     "none": "neither the mechanics nor a constant error of a sensor, as far as these unknowns can show",
 }

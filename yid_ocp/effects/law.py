@@ -115,8 +115,7 @@ def _truncated_power_weights(count: int) -> Array:
     """Weights (count + 1, count) of 1, x and max(x - k, 0)^3 for the natural spline through values at x = 0, 1, ..."""
     x = np.arange(count, dtype=float)
     powers = np.column_stack([np.ones(count), x, np.maximum(x[:, None] - x[:-1], 0) ** 3])
-    no_curvature_at_end = np.concatenate([[0, 0], x[-1] - x[:-1]])
-    return np.asarray(np.linalg.inv(np.vstack([powers, no_curvature_at_end]))[:, :count], float)
+    return np.asarray(np.linalg.inv(np.vstack([powers, np.concatenate([[0, 0], x[-1] - x[:-1]])]))[:, :count], float)
 
 
 def _coordinate_indices_and_factors(system: System, location: str) -> dict[int, float]:

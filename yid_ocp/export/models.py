@@ -48,8 +48,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
-    gravity = mjcf.CasadiEvaluator(system, values)(system.gravity)
-    SubElement(world, "gravity").text = mjcf.format_xml_numbers(gravity)
+    SubElement(world, "gravity").text = mjcf.format_xml_numbers(mjcf.CasadiEvaluator(system, values)(system.gravity))
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
         _sdf_link(model, tree, i)

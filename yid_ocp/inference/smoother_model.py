@@ -250,8 +250,7 @@ def residual_models_with_smoother_unknowns(
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
-        factor = np.concatenate([block.robust_factor for block in blocks])
-        found.append(_recording(course, factor, observed, interval))
+        found.append(_recording(course, np.concatenate([block.robust_factor for block in blocks]), observed, interval))
     prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations on which no unknown acts
     first, *later = found[0].intervals

@@ -206,8 +206,7 @@ class CompiledKernel:
         motion = self._motion(steps, theta, None, None, feedback, self._directions(names, len(names)))
         along, partials = _along(rollout.state, rollout.multipliers, rollout.torque), map(_doubles, by)
         made = _filled(_Gradient, *vars(gradient).values())
-        code = self._call("yid_adjoint", motion, along, _filled(_Partials, *partials), made)
-        if code != NewtonStatusCode.OK:
+        if self._call("yid_adjoint", motion, along, _filled(_Partials, *partials), made) != NewtonStatusCode.OK:
             for array in vars(gradient).values():
                 array[:] = np.nan
         return gradient

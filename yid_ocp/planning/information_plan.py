@@ -351,8 +351,7 @@ def _active(
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    values = limits.constraints_and_jacobian(mover.simulate_path(w), w)[0]
-    for rows, own in limits.split_values_by_limit_kind(values):
+    for rows, own in limits.split_values_by_limit_kind(limits.constraints_and_jacobian(mover.simulate_path(w), w)[0]):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()

@@ -120,9 +120,6 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 @register_summary("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
-    yield replace(score, is_key_table=True)
-    yield from others
-    yield replace(cases, is_page_only=True)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
     said = [f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}')."]
     if right["of"]:
@@ -131,7 +128,14 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
     if alarms["of"]:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
+    if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
+        near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
+        do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
+        said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
     yield from (SummaryStatement(text, "verdict") for text in said)
+    yield replace(score, is_key_table=True)
+    yield from others
+    yield replace(cases, is_page_only=True)
 
 
 def blind_validation_markdown_lines(result: Mapping[str, Any]) -> list[str]:
@@ -172,7 +176,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged", 0)))
         experiments.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
-    sure_of: TableRows = [("probability of the named sets, by fifths of the cases", "sets that hold the cause")]
+    sure_of: TableRows = [("stated probability (mean of a fifth of the cases)", "named sets that hold the cause")]
     sure_of += [(f"{own['level']:.2f}", _rate(own)) for own in result["calibration"]["probabilities"]]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]

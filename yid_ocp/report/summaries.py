@@ -238,19 +238,19 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
-        rows = [("change", "found", "gain [nat]")]
-        yield "Gain: more information on all parameters. 0.7 nat halves the standard deviation of one parameter."
-        changes = {own["words"]: own for own in (asked["base"], *asked["singles"], *asked["smallest"])}
+        said = "No set of up to three changes makes it possible to find all parameters."
+        if asked["smallest"]:
+            said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
+        yield SummaryStatement(said, "verdict")
+        rows = [("change", "parameters found", "gain [nat]")]
+        yield "Gain: information on all parameters. 0.7 nat more halves the standard deviation of one parameter."
+        changes = {own["words"]: own for own in (asked["base"], *asked["smallest"], *asked["singles"])}
         for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
             count = f"{entry['identifiable']} of {len(parameters)}" if entry["gain"] is not None else "unknown"
             rows.append((entry["words"], count, gain))
         yield SummaryTable(rows, "What another experiment would identify")
         yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
-        said = "No set of up to three changes makes it possible to find all parameters."
-        if asked["smallest"]:
-            said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
-        yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
     text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     text += ", at the values of a fit that did not converge" * (result["status"] not in ("converged", "not_solved"))
@@ -365,7 +365,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
     yield from (entry["words"] for entry in result["mechanics"].values() if entry["agrees"])
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
-    rests = []
+    rests = dict[str, list[str]]()
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"
         for name, group in entry["groups"].items():
@@ -375,9 +375,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = [] if rest is None else ["an equilibrium was found" if rest["found"] else rest["message"]]
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
         said += ["hand and object are apart at grasp " + ", ".join(gaps)] if gaps else []
-        rests.append(f"At the start of '{entry['recording']}', {', and '.join(said)}." if said else "")
+        rests.setdefault(", and ".join(said), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
-    yield from rests
+    yield from (f"At the start of {', '.join(names)}, {said}." for said, names in rests.items() if said)
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
         rows = [(head, "lowest frequencies [Hz]", "")]
@@ -389,7 +389,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     misfit, moved, warnings = result["initial_misfit"], discretisation_shift_sentences(result), result["warnings"]
     if misfit is not None and misfit > _MAX_INITIAL_MISFIT:
         far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
-        far += "Tests of links and time step say little there: they are in result.json, and `solve` repeats them."
+        far += "`solve` lowers it, and repeats the tests of the discretisation. They say little before (result.json)."
         yield SummaryStatement(far, "verdict")
     else:
         fine = "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)"
@@ -460,7 +460,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters")
     for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
         parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
-        yield SummaryTable([(head, "number", "first", "meaning"), *parts], head.capitalize())
+        yield SummaryTable([(head, "number", "first name", "meaning"), *parts], head.capitalize())
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
@@ -471,7 +471,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 _INSPECTION_FILES = (
     ("file", "holds"),
     ("linearisation.h5", "the matrices"),
-    ("sparsity.png", "their entries that can be nonzero"),
+    ("sparsity.png", "which entries of the matrices in linearisation.h5 can be nonzero"),
     ("result.json", "the equations that contain each parameter; sizes of functions and matrices"),
     ("equations.txt", "all equations and names"),
 )
@@ -530,7 +530,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
     used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
-    yield from (f"{count_with_noun(n, 'image')} not used, because {why}." for why, n in result["dropped"].items())
+    for why, n in result["dropped"].items():
+        names = [own["name"] for own in result["frames"] if own["reason"].partition(":")[0] == why]
+        yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 
@@ -548,6 +550,9 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     entries = (manifest["effects"] | grasps | listed).items()
     rows: TableRows = [("part of the model", "in the file", "element of the file, or reason")]
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
+    lost = [name for name, entry in entries if entry["status"] == "not representable"]
+    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
+    yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
     yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
     gate = manifest["gate"]
     if gate is None:

@@ -171,19 +171,23 @@ def misfit_summary_blocks(
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each tried finer discretisation: which estimates it shifts by more than their std."""
-    said, kinds = list[str](), {"links": "twice the links", "time_step": "half the time step"}
-    kinds["encoder_noise"] = "the stated encoder noise once more"
+    """Return a sentence for each tried finer discretisation of a fit that ended: which estimates it shifts too far."""
+    said, free = [], result["parameters"] if result["format"] == "yid-solve/1" else {}
+    units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in free.items()}
+    again, wide = (", and solve again", " The ± of the table includes this.") if free else ("", "")
+    kinds = {"links": "twice the links", "time_step": "half the time step"}
+    kinds["encoder_noise"] = "encoder noise of the stated size added once more"
     limits = " This assumes that the noise is as stated (sensors.joints.position.std), and tests for no other error."
+    found = {} if result.get("status") in ("stalled", "iteration_limit") else result.get("discretisation", {})
     for key, words in kinds.items():
-        tried = {name: own for name, own in result.get("discretisation", {}).items() if own.get(key) is not None}
+        tried = {name: own for name, own in found.items() if own.get(key) is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
-        changes = [f"{n} by {moved[n][key]:+.2g} (± {moved[n]['std']:.2g})" for n in worst]
+        changes = [f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
-            remedy = f" To cure this, set {setting}." if (setting := result.get("finer_settings", {}).get(key)) else ""
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{remedy}")
+            cure = f" To cure this, set {own}{again}." if (own := result.get("finer_settings", {}).get(key)) else ""
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}{cure}")
         elif tried:
             is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
             end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")

@@ -201,8 +201,7 @@ def expand_to_joint_values(
                 allowed, hint = f"a value for each of {', '.join(names)}", f"add {name}: NUMBER to {key}"
                 raise ConfigError(f"'{name}' has no value", where=key, allowed=allowed, hint=hint)
         return np.array([float(given[name]) for name in names])
-    wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
-    return wide[[list(recorded).index(name) for name in names]]
+    return np.broadcast_to(np.asarray(given, float), (len(recorded),))[[list(recorded).index(name) for name in names]]
 
 
 class Sensor(ABC):

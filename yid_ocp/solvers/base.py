@@ -362,14 +362,14 @@ class _MultiStartSearch:
             best = self._best
             if not best.evaluation.ok or assess_goodness_of_fit(best.weighted, best.evaluation, limits).explains:
                 break
-            self._try(self._multiple(best.result.x, factor), f"best fit x {factor:g}", most)
+            self._try(self._multiple(best.result.x, factor), f"best fit times {factor:g}", most)
         minima = start_vectors_toward_other_minima(self._best.weighted, self._best.evaluation, self._best.result.x)
         most = self._n_starts + len(minima)
         for near in minima:
             self._try(near, "another local minimum", most)
 
     def _try_multiple(self, first: Array, factor: float, most: int) -> None:
-        self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
+        self._try(self._multiple(first, factor), f"initial values times {factor:g}", most)
 
     def _multiple(self, x: Array, factor: float) -> Array:
         return np.where(self._problem.positive_unknowns_mask, np.clip(x * factor, *self._problem.bounds), x)

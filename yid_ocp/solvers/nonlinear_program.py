@@ -511,7 +511,7 @@ class NonlinearProgram(ReprMixin):
         for symbol in ca.symvar(ca.vertcat(scalar, column)):
             if not any(ca.is_equal(symbol, vector) for vector in (self.w, self.p)):
                 message = f"the symbol '{symbol.name()}' is neither a variable nor a parameter of the program"
-                allowed, hint = "expressions of nlp.w, nlp.p and of nlp[NAME]", "use nlp[NAME] in place of the symbol"
+                allowed, hint = "expressions of nlp.w, nlp.p and of nlp[NAME]", "use a number or nlp[NAME] in its place"
                 raise SolverError(message, where=where, allowed=allowed, hint=hint)
         for name, side in (("lower", lower), ("upper", upper)):
             given = np.asarray(side, float).ravel()

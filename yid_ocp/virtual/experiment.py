@@ -134,8 +134,7 @@ def run_virtual_experiment(
     `ConfigError` if torque noise does not match the joints; other errors are as in `simulate_in_mujoco`.
     """
     chosen = experiment or VirtualExperimentSettings()
-    duration = chosen.simulation.duration
-    posture = chosen.initial_joint_angles
+    duration, posture = chosen.simulation.duration, chosen.initial_joint_angles
     posture = joint_motion.grasping_joint_angles(system, values) if posture is None else posture
     excitation = joint_motion.MultisineOptions(duration=duration)
     motion = chosen.motion or joint_motion.random_multisine_motion(
@@ -249,8 +248,7 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
     if camera.has_dropouts:
         number = max(1, round(duration / 2.5))
         starts = duration / number * (np.arange(number) + rng.uniform(0.15, 0.45, number))
-        lengths = rng.uniform(1.0, 1.5, number)
-        times = times[~((times[:, None] >= starts) & (times[:, None] <= starts + lengths)).any(1)]
+        times = times[~((times[:, None] >= starts) & (times[:, None] <= starts + rng.uniform(1.0, 1.5, number))).any(1)]
     return np.asarray(times)
 
 

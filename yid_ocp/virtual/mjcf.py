@@ -330,7 +330,7 @@ def _bodies(
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
             SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            what, hint = "more than six joints in series have no mass between them", "give a link between them a mass"
+            what, hint = "more than six joints in series have no mass between them", "give one of the links a mass"
             allowed = "up to six joints in series, with a mass on the link of the last one"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         body = merge_inertias(joint.bodies)
@@ -453,7 +453,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
-            what = f"grasp '{grasp.name}' of the kind {grasp.kind} is compliant, which MuJoCo cannot express"
+            what = f"MuJoCo has no {'exact ' * (not emulate)}term for a compliant grasp of the kind {grasp.kind}"
             hint = f"leave out the effect grasp_compliance@{grasp.name}"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():

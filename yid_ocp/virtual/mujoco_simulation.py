@@ -77,8 +77,9 @@ class SimulationOptions:
             raise ConfigError(what, where="time_step", allowed=allowed, hint=hint)
         require_known_names([self.effort_kind], get_args(EffortSamplingKind), "kind", "effort_kind", ConfigError)
         if self.effort_kind == "command" and periods > 1:
-            what = f"effort_kind = 'command', but the controller ({controller:g} Hz) changes commands within a sample"
-            allowed = f"sample or mean; command with controller_rate = {self.sample_rate:g} Hz"
+            what = f"the controller ({controller:g} Hz) changes commands within a sample ({self.sample_rate:g} Hz), so "
+            what += "effort_kind='command' (the default) has no single value per sample"
+            allowed = f"sample, or mean (of each sample); command with controller_rate = {self.sample_rate:g} Hz"
             raise ConfigError(what, where="effort_kind", allowed=allowed, hint="pass effort_kind='mean'")
 
     @property
@@ -412,8 +413,7 @@ def replay_mismatch_by_channel(
     `DataError` if MuJoCo is not installed.
     """
     mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
-    moved = system.driven or system.prescribed
-    joints = recording.joints
+    moved, joints = system.driven or system.prescribed, recording.joints
     missing = set(moved).difference(() if joints is None else joints.names)
     if joints is None or missing or not moved:
         names = f"{', '.join(sorted(missing)) or 'a joint'}, of the {len(moved)} joints that are driven or prescribed"

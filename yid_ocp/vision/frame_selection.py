@@ -182,16 +182,18 @@ def times_configurations_points_of_good_frames(
     flat = position.reshape(-1, 3), velocity.reshape(-1, 3), np.repeat([frames[k].stamp for k in good], len(of))
     shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
     std = np.hypot(std, shared)
-    unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_seen_point_std
-    unseen |= ~np.array([fit.is_point_seen[of] for fit in fits])
+    seen, limit = np.array([fit.is_point_seen[of] for fit in fits]), options.max_seen_point_std
+    unseen = (np.linalg.norm(std, axis=2) > math.sqrt(3.0) * limit) | ~seen
     if unseen.all():
-        best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
-        wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_seen_point_std).all())
-        limit = f"the smallest std is {best:.0f} mm, but must be at most {1e3 * options.max_seen_point_std:g} mm"
-        what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
-        check = f"check track.camera_pose and the camera's clock. {calibration.message}"
-        allowed = "a std of at most track.options.max_seen_point_std for one point in one frame"
-        raise DataError(what, where=source, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
+        best = float(np.sqrt((std**2).mean(axis=2))[seen].min(initial=math.inf))
+        is_size = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * limit).all())
+        known = f"no point is known to {1e3 * limit:g} mm in any frame: the smallest std is {1e3 * best:.3g} mm"
+        what = f"{_because(sizes, is_size)}{known if seen.any() else 'no frame shows a point'}"
+        check, where = "check track.camera_pose and the camera's clock", "track.options.max_seen_point_std"
+        if seen.any() and not is_size:
+            check = f"set {where}: {best + 5e-4:.3f} if this accuracy is enough. If not, {check}"
+        allowed = f"one point in one frame with a std of at most {1e3 * limit:g} mm"
+        raise DataError(what, where=where, allowed=allowed, hint=_hint(sizes, foreign_objects, check))
     position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
     return t, np.array([fit.q for fit in fits]), position, std, shared
 

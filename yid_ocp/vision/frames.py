@@ -114,8 +114,7 @@ class CameraIntrinsics:
             factor = np.where(radius > 1e-9, bent / np.maximum(radius, 1e-9), 1.0)
             return x * factor, y * factor
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
-        above = 1 + square * (k1 + square * (k2 + square * k3))
-        factor = above / (1 + square * (k4 + square * (k5 + square * k6)))
+        factor = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
         beside_x, beside_y = p2 * (square + 2 * x**2), p1 * (square + 2 * y**2)
         return x * factor + 2 * p1 * x * y + beside_x, y * factor + beside_y + 2 * p2 * x * y
 

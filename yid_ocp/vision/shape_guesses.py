@@ -165,8 +165,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
         short = [(length, way) for length, way in branches if length < twig and count[way[-1]] > 2]
         if not short:
             break
-        gone = np.array(min(short, key=lambda found: found[0])[1][:-1])
-        edges = edges[~np.isin(edges, gone).any(axis=1)]
+        edges = edges[~np.isin(edges, np.array(min(short, key=lambda found: found[0])[1][:-1])).any(axis=1)]
     used = np.unique(edges)
     return replace(trace, nodes=nodes[used], edges=_renumbered(used, len(nodes))[edges])
 

@@ -233,8 +233,7 @@ class ArticulatedSurfaces:
             nearer = hit < distance
             distance[nearer], owner[nearer] = hit[nearer], part
             normal[nearer] = normals[nearer] @ pose[:3, :3].T
-        away = np.einsum("ij,ij->i", normal, directions) > 0
-        return distance, np.where(away[:, None], -normal, normal), owner
+        return distance, np.where((np.einsum("ij,ij->i", normal, directions) > 0)[:, None], -normal, normal), owner
 
     def _cast(self, part: int, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Distances, in multiples of `directions`, and normals at the intersections of rays in a part's frame."""

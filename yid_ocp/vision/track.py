@@ -406,7 +406,7 @@ class SingleFrameTracker:
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < _MIN_POINTS:
-            raise dropped_frame_error(f"too few points of the object: {len(cloud)} are left, {_MIN_POINTS} are needed")
+            raise dropped_frame_error(f"too few points of the object are left: {len(cloud)} of {_MIN_POINTS} needed")
         if len(cloud) > _MAX_POINTS:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), _MAX_POINTS, replace=False)))
             work.say(n_filtered_points=len(cloud))

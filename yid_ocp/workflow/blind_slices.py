@@ -37,8 +37,7 @@ def write_slice_results(found: Mapping[str, Any], folder: Path) -> dict[str, Any
 
 def _ensemble_sha256(part: Mapping[str, Any]) -> str:
     """Return a hash of what all slices of one ensemble share: cases, seed, settings, sources, number of slices."""
-    common = [part[key] for key in _COMMON_KEYS]
-    text = json.dumps([*common, str(part["slice"]).partition("/")[2]], sort_keys=True)
+    text = json.dumps([*[part[key] for key in _COMMON_KEYS], str(part["slice"]).partition("/")[2]], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -279,7 +279,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if closed:
         return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
-        return "prescribed", f"the arm moves as measured, as it carries the object, and {seen} show the object"
+        return "prescribed", f"the arm moves as measured, as it carries the object, and {seen} were recorded"
     return "prescribed", "the arm moves as measured; the object is estimated from its efforts, the only other data"
 
 
@@ -309,8 +309,7 @@ def _speeds(t: Array, values: Array, time: float) -> tuple[Array, Array]:
     """Return the absolute slope of each channel's line over a window, and its std; zeros for fewer than 4 samples."""
     # the first five frames of a slow camera do not show whether its points started at rest
     window = float(np.clip(5 * (median_sample_period(t) or math.inf), _REST_WINDOW, 2 * _REST_WINDOW))
-    rows = (t >= time - 1e-9) & (t <= time + window)
-    zeros = np.zeros(values.shape[1])
+    rows, zeros = (t >= time - 1e-9) & (t <= time + window), np.zeros(values.shape[1])
     if rows.sum() < 4:
         return zeros, zeros
     centred = t[rows] - t[rows].mean()
@@ -405,7 +404,10 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} object lengths away from {holder}. Check the frame of its positions"
+            return (
+                "",
+                f"it is {part:.1f} object lengths away from {holder}. Is it on the object, in the world frame?",
+            )
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
@@ -416,7 +418,7 @@ def _near(
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}
     name = min(apart, key=apart.__getitem__)
     if apart[name] > 0.5 * max(branch.length for branch in branches):
-        return "", f"it is {apart[name]:.2g} m away from the straight object. Check the frame of its positions"
+        return "", f"it is {apart[name]:.2g} m away from the straight object. Is it in the world frame?"
     return name, f"it is {1e3 * apart[name]:.0f} mm from this frame when the object is straight"
 
 

@@ -171,16 +171,13 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         return head | {"effects": {}, "parameters": {}, "gate": None}
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
-    grasp = FeatureExportSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
-    if form == "mjcf":
-        grasp = FeatureExportSupport("native", "equality constraints between sites (compliant grasp: a tendon)")
+    grasps = {g.name: _grasp_support(form, supports.get(f"grasp_compliance@{g.name}")) for g in full.grasps}
     parameters = {}
     for name, entry in models.support_in_export_format_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
-    lost_grasps = [own.name for own in full.grasps if grasp.loses_motion_or_force]
-    _refuse_losses(form, is_lossy, supports, parameters, lost_grasps)
+    _refuse_losses(form, is_lossy, supports, parameters, grasps)
     manifest: dict[str, Any] = {
         "format": EXPORT_MANIFEST_FORMAT,
         "file": out.name,
@@ -189,7 +186,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "result": file_sha256(folder / "result.json"),
         "effects": {label: vars(entry) for label, entry in supports.items()},
         "parameters": parameters,
-        "grasps": {own.name: vars(grasp) for own in full.grasps},
+        "grasps": {name: vars(entry) for name, entry in grasps.items()},
         "gate": None,
         "versions": software_and_plugin_versions(),
     }
@@ -205,18 +202,30 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     return manifest
 
 
+def _grasp_support(form: str, compliance: FeatureExportSupport | None) -> FeatureExportSupport:
+    """Return how a format represents a grasp with an effect `compliance`, which it represents as stated."""
+    if form != "mjcf":
+        why = f"{form.upper()} describes a tree: close the loop in the engine"
+        return FeatureExportSupport("not representable", why)
+    rigid = "equality constraints between sites"
+    if compliance is None or compliance.how.startswith("neutral"):
+        return FeatureExportSupport("native", rigid)
+    is_lost = compliance.status == "not representable"
+    return FeatureExportSupport("emulated", f"{rigid}: the grasp is rigid" if is_lost else "a tendon with a spring")
+
+
 def _refuse_losses(
     form: str,
     is_lossy: bool,
     effects: Mapping[str, FeatureExportSupport],
     parameters: Mapping[str, Mapping[str, Any]],
-    grasps: Sequence[str],
+    grasps: Mapping[str, FeatureExportSupport],
 ) -> None:
     """Refuse a file that lacks effects, estimates or grasps of the model, unless losses are accepted."""
     lost = [label for label, entry in effects.items() if entry.loses_motion_or_force]
     absent = [name for name, own in parameters.items() if own["estimated"] and own["status"] == "not representable"]
     lost += [name for name in absent if name.rpartition(".")[0] not in effects]
-    lost += [f"grasp {name}" for name in grasps]
+    lost += [f"grasp {name}" for name, entry in grasps.items() if entry.loses_motion_or_force]
     if lost and not is_lossy:
         what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
         hint = "add --lossy to write the file without them; the manifest beside it (.json) has the reason for each"

@@ -215,12 +215,13 @@ def _summary_lines(
 
 def _place_sentences(places: Iterable[Any]) -> list[str]:
     """Return a sentence on the frame of points, or of sensors. Those with the same frame and reason share it."""
-    points: dict[str, list[str]] = {}
-    for own in places:
-        frame = f"the frame {own.frame} of the model" if own.frame else "no frame and does not use it"
-        words = "the frame of the same name" if own.frame == own.point else f"{frame}, because {own.reason}"
-        points.setdefault(words, []).append(own.point)
-    return [f"`init` assigns recorded {abbreviated_names_text(n, math.inf)} to {w}" for w, n in points.items()]
+    points = dict[tuple[str, str], list[str]]()
+    for own in sorted(places, key=lambda place: bool(place.frame)):
+        place = f" to the frame {own.frame} of the model" if own.frame else ""
+        words = " to the frame of the same name" if own.frame == own.point else f"{place}, because {own.reason}"
+        points.setdefault(("assigns" if own.frame else "leaves out", words), []).append(own.point)
+    named = ((does, words, abbreviated_names_text(own, math.inf)) for (does, words), own in points.items())
+    return [f"`init` {does} recorded {names}{words}" for does, words, names in named]
 
 
 def _with_points_at_frames(recording: Recording, proposal: ProposedConfigChoices) -> Recording:

@@ -90,8 +90,7 @@ def _registering(
     before = [set(registry) for registry in registries]
     try:
         yield
-        unchanged = all(set(registry) == names for registry, names in zip(registries, before, strict=True))
-        if unchanged and not known:
+        if all(set(registry) == names for registry, names in zip(registries, before, strict=True)) and not known:
             allowed = "@EFFECTS.register(NAME), or another decorator that docs/howto/extending.md describes"
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:

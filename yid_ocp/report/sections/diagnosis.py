@@ -68,12 +68,14 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             values["noise alone"] = (factor * floor[channel], None)
         rows.append((channel, shown, values))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
+    sentences = []
     if changed:
-        names = " and ".join(effect.label for effect in finding.accepted_effects)
+        names = ", ".join(effect.label for effect in finding.accepted_effects)
+        is_left = finding.remaining_test.p_value < finding.thresholds.significance_level
+        rest = "Predictions still err by more than noise" if is_left else "Noise and the ± explain what remains"
         falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
         change = f"goes from {first:.3g} to {last:.3g} (noise alone gives 1)"
-        sentences.append(f"With {names}, chi² per degree of freedom of held-out recordings {change}.")
+        sentences.append(f"{rest}: with {names}, chi² per degree of freedom of held-out recordings {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
             errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
@@ -84,6 +86,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         sentences.append(f"No effect is accepted as cause, so the figure has the nominal model alone. {level}.")
         tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
         sentences.append(f"The table above also has the errors with {tried}, not accepted as cause." if tried else "")
+    sentences.append("The figure shows rms errors on held-out recordings, and the part of them from noise alone.")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -111,7 +114,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         gap_locations_sentence(finding),
         f"Nothing is wrong at {noticed}: a gap would have been detected there." if noticed else "",
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
-        f"The effects leave a gap, mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
+        f"What the effects leave is mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
         "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
         "change over time, are added to the model, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
