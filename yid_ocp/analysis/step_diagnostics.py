@@ -246,8 +246,7 @@ def step_jacobian_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, Sp
         parts = [np.hstack([block(row, column) for column in columns]) for row in ("del", "internal", "constraint")]
         return np.vstack([parts[0][free], *parts[1:]])
 
-    by_new = by("q1", "z1", "lam")
-    nc = len(joints)
+    by_new, nc = by("q1", "z1", "lam"), len(joints)
     known = np.setdiff1d(np.arange(by_new.shape[1]), system.prescribed_coordinate_indices)
     by_unknown = by_new[:, known]
     inverse = _inverse_sparsity(by_unknown)

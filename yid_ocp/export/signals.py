@@ -59,8 +59,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
         what, hint = "the signals have no samples", "export a recording or run that has samples"
         raise OutputError(what, where=str(path), allowed="signals with one sample or more", hint=hint)
     store = get_typestore(Stores.ROS2_HUMBLE)
-    first = min(float(np.min(signal.t)) for signal in signals if len(signal.t))
-    shift = float(max(0.0, -np.floor(first)))
+    shift = float(max(0.0, -np.floor(min(float(np.min(signal.t)) for signal in signals if len(signal.t)))))
     made = [(stamp, k, told) for k, signal in enumerate(signals) for stamp, told in _messages(signal, shift, store)]
     made.sort(key=lambda entry: entry[:2])
     try:

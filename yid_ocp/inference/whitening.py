@@ -128,8 +128,7 @@ class WhiteningFilter:
         self, part: _FilterPart, mean: Array, own: Array, push: Array | None, white: Array | None = None
     ) -> tuple[Array, Array, Array | None]:
         """Innovations of some steps, and the mean after them. With torque noise `white`, also the mean before each."""
-        noise = self.input_error_model.torque_noise
-        known = None
+        noise, known = self.input_error_model.torque_noise, None
         if push is not None and part.first < len(push):
             known = push[part.first : part.first + len(part.kalman.moves)]
             own = own.copy()

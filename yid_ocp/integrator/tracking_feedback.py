@@ -32,8 +32,7 @@ def proportional_tracking_feedback(step: Step, measured: ArrayLike, gains: Array
     K is diagonal. `measured` holds the joint angles qbar at every node, (N + 1, nu) [rad]. `gains` [N m/rad] holds one
     gain, one for each joint of an arm, or nu gains. Raises `ModelError` for another number of gains or a negative gain.
     """
-    reference = np.asarray(measured, float)
-    nu = step.sizes["nu"]
+    reference, nu = np.asarray(measured, float), step.sizes["nu"]
     values = np.atleast_1d(np.asarray(gains, float))
     if values.size not in (1, nu) and nu % max(values.size, 1):
         what = f"the settings have {values.size} gains for {nu} driven joints"

@@ -278,8 +278,7 @@ def _diagnose_case_from_recordings_task(
     """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
-    begun = time.perf_counter()
-    evidence = None
+    begun, evidence = time.perf_counter(), None
     try:
         finding = blind.diagnose_unlabelled_case(ensemble, case, candidates, run.diagnosis)
         result, evidence = finding.to_dict(), blind_scores.diagnosis_evidence_to_dict(finding)
