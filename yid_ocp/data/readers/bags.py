@@ -215,12 +215,12 @@ def _read_bag(
         said = "computed by the robot's driver from the joint torques, without the loads that it knows"
         more = (*more, f"{ESTIMATED_WRENCH_GROUP_NAME} is {said}. Use it in place of the efforts, not with them")
     used |= {message.source for message in bag.mounted}
-    turned = {message.source for message in places if message.content.axes is not None}
+    turned, names = {m.source for m in places if m.content.axes is not None}, _names_of(bag)
     if turned and distance is None:
         said = f"of {abbreviated_names_text(sorted(turned))}, the orientations were not imported, only the positions. "
         said += "--pose-axis-point-distance 0.1 at the import keeps them as points 0.1 m away on the axes of each pose"
         more = (*more, said)
-    others = (_preview_source(topic, bag, _names_of(bag)) for topic in bag.file.topics if topic.name not in used)
+    others = (_preview_source(topic, bag, names) for topic in bag.file.topics if topic.name not in used)
     left = [
         f"{s.name} was left out ({s.n_samples} of {s.kind}): {'not selected' if s.imported_as else s.note}"
         for s in others
