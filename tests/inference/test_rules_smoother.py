@@ -334,14 +334,23 @@ def said_of(problem: EstimationProblem):
     return smooth_unknown_forces_and_biases(problem, np.array(solution.x), solution.evaluation)
 
 
+def as_they_are(observed, by_state, by_unknown, transition, drive, typical):
+    none = np.zeros((observed.shape[1], observed.shape[1]))
+    return _IntervalModel(observed, by_state, by_unknown, transition, drive, none, len(observed))
+
+
+def test_rows_that_are_left_out_change_nothing(driven, monkeypatch):
+    problem = problem_of(driven, recorded(driven, {0: (0.3, 0.6, 1.0)}, 1))
+    short = said_of(problem)
+    monkeypatch.setattr(smoother_model, "_compressed", as_they_are)
+    whole = said_of(problem)
+    assert short.log_evidence == pytest.approx(whole.log_evidence, rel=1e-6)
+    assert short.chi2_after == pytest.approx(whole.chi2_after, rel=1e-6)
+
+
 @pytest.mark.parametrize("feedback", ["none", "lqr"])
 def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, feedback):
     """Whatever keeps the arm on its measured motion, whose momentum has the push in it."""
-
-    def as_they_are(observed, by_state, by_unknown, transition, drive):
-        none = np.zeros((observed.shape[1], observed.shape[1]))
-        return _IntervalModel(observed, by_state, by_unknown, transition, drive, none, len(observed))
-
     monkeypatch.setattr(smoother_model, "_compressed", as_they_are)
     recording = recorded(driven, {}, 1)
     problem = problem_of(driven, recording, feedback)

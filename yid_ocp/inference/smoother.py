@@ -52,6 +52,7 @@ _MAX_GROUPS = 4  # selected at most
 _MAX_STD_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
+_INTERVALS_PER_PRODUCT = 8  # whose responses are multiplied at once
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
 
@@ -315,6 +316,21 @@ def _responses(base: _Filtered, chosen: IntArray, correlation: float) -> Array:
     return found
 
 
+def _products(responses: Array, base: _Filtered, unknowns: int) -> tuple[Array, Array]:
+    """Products of `_responses` with themselves (J u, J u) and with the innovations (J u, 1 + ntheta)."""
+    size, first = responses.shape[1], 0
+    information, pull = np.zeros((size, size)), np.zeros((size, len(base.products)))
+    white = np.vstack([update.white for update in base.updates])
+    ends = np.cumsum([len(update.white) for update in base.updates])
+    for last in [*range(_INTERVALS_PER_PRODUCT, len(ends), _INTERVALS_PER_PRODUCT), len(ends)]:
+        # disturbances do not affect the innovations of earlier intervals
+        span, known, first = slice(first, ends[last - 1]), last * unknowns, ends[last - 1]
+        rows = responses[span, :known]
+        information[:known, :known] += rows.T @ rows
+        pull[:known] += rows.T @ white[span]
+    return information, pull
+
+
 def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) -> tuple[float, float]:
     """Largest log evidence over the variance s^2 of one additional group, and this variance.
 
@@ -326,8 +342,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     parts = []
     for base in bases:
         chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
-        rows = _responses(base, chosen, base.model.interval_correlation)
-        parts.append((rows.T @ rows, rows.T @ np.vstack([update.white for update in base.updates])))
+        parts.append(_products(_responses(base, chosen, base.model.interval_correlation), base, len(chosen)))
 
     def cost(exponent: float) -> float:
         variance, left, determinant = 10.0**exponent, products, log_determinant

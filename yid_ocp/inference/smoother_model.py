@@ -49,6 +49,7 @@ _MIN_INTERVAL = 0.1  # shortest time over which unknowns are constant [s]
 _MAX_INTERVAL_COUNT = 150  # largest number of intervals; longer recordings have longer intervals
 # Reference sizes of unknowns: a force over the load at its place, an offset of a grasp [m], a bias over its noise.
 _FORCE_STD_OVER_LOAD, _GRASP_OFFSET_STD, _BIAS_STD_OVER_NOISE = 0.1, 2e-3, 3.0
+_NEGLIGIBLE_ROW = 1e-4  # of its noise: rows that typical changes of states and unknowns affect less are left out
 _FORCE_POINT = "75%"  # point of the push by arc length: a compromise of tip and distributed loads
 
 
@@ -321,7 +322,7 @@ def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, short
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"
     ns, driving = len(moving), unknowns.driving
-    at_rest = np.zeros((ns, len(unknowns.names)))
+    at_rest, start_std = np.zeros((ns, len(unknowns.names))), np.zeros(ns) if rests else _loose_start(course)[moving]
     intervals = []
     for j in range(len(edges) - 1):
         span_of_steps = slice(int(edges[j]), min(int(edges[j + 1]) + beyond, steps))
@@ -336,13 +337,14 @@ def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, short
         moved *= factor[rows, None]
         by_unknown = np.hstack([moved[:, ns:], own])
         drive = np.pad(drive, ((0, 0), (0, own.shape[1])))
-        intervals.append(_compressed(observed[rows], moved[:, :ns], by_unknown, state, drive))
+        # changes of the state that unknowns of reference size cause in one interval, or that the start allows
+        typical = np.linalg.norm(np.column_stack([drive, at_rest, start_std]), axis=1)
+        intervals.append(_compressed(observed[rows], moved[:, :ns], by_unknown, state, drive, typical))
     span = h * float(np.median(np.diff(edges)))
     decay = math.exp(-span / _CORRELATION_TIME)
     told = h * edges, unknowns.names, unknowns.sources, unknowns.reference
-    start = at_rest, np.zeros(ns) if rests else _loose_start(course)[moving]
     noise = _torque_noise(course, unknowns, span, decay)
-    return ResidualStateSpaceModel(course.episode.name, tuple(intervals), *told, *start, decay, noise)
+    return ResidualStateSpaceModel(course.episode.name, tuple(intervals), *told, at_rest, start_std, decay, noise)
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:
@@ -386,7 +388,8 @@ def _interval_response(
         effort[k] = by_effort[k][:, :ns] @ node[k]
         effort[k][:, ns:] += by_effort[k][:, ns:]
     effort[-1] = effort[-2]
-    return node[length][:, :ns], node[length][:, ns:], slopes.directional_residual_derivatives(node, effort, first)
+    state, drive = np.split(node[length].copy(), [ns], axis=1)
+    return state, drive, slopes.directional_residual_derivatives(node, effort, first)
 
 
 def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:
@@ -400,14 +403,18 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
     return np.concatenate(found)
 
 
-def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> _IntervalModel:
-    """An interval with as many rows as columns; residual orthogonal to all columns only adds to the products."""
+def _compressed(
+    observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array, typical: Array
+) -> _IntervalModel:
+    """An interval with only the rows that states or unknowns affect; the others only add to the products."""
     joined, count = np.hstack([by_state, by_unknown]), len(observed)
     rest = np.zeros((observed.shape[1], observed.shape[1]))
-    if len(joined) > joined.shape[1]:
-        q, r = scipy.linalg.qr(joined, mode="economic", check_finite=False)
+    if len(joined):
+        sizes = np.append(typical, np.ones(by_unknown.shape[1]))
+        q, r, _ = scipy.linalg.qr(joined * sizes, mode="economic", pivoting=True, check_finite=False)
+        q = q[:, np.abs(np.diag(r)) > _NEGLIGIBLE_ROW]
         turned = q.T @ observed
         rest = observed.T @ observed - turned.T @ turned
-        observed, joined = turned, r
+        observed, joined = turned, q.T @ joined
     ns = by_state.shape[1]
     return _IntervalModel(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
