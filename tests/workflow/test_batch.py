@@ -178,7 +178,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     with pytest.raises(OutputError, match=r"another blind test \(2 cases, seed 3, for report\).*in: purpose"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
-    with pytest.raises(DataError, match="do not match the hashes"):
+    with pytest.raises(DataError, match="changed after the diagnosis began"):
         run_blind([driven], folder, 2, 3, workers=InlineExecutor())
 
 
