@@ -365,8 +365,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
-    joint = problem.options.multivariate_prior
-    known = dict(problem.options.prior_stds)
+    joint, known = problem.options.multivariate_prior, dict(problem.options.prior_stds)
     known |= dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True))
     found = {}
     for entry in (e for e in entries if e.name in (*problem.shared_parameters, *problem.local_parameters)):

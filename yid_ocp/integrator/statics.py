@@ -126,8 +126,7 @@ class EquilibriumSolver:
             if converged and guess is not None:
                 best = (False, 0.0, error, w)
                 break
-            inner = w[count - nz : count]
-            placed = ca.DM(self._configuration(w, given))
+            inner, placed = w[count - nz : count], ca.DM(self._configuration(w, given))
             energy = float(self._energy(placed, inner, hold, theta)) if converged else error
             if best is None or (not converged, energy) < best[:2]:
                 best = (not converged, energy, error, w)

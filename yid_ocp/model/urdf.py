@@ -58,8 +58,7 @@ def _example_robot_urdf(robot: str) -> Path:
     if folder is None:
         what, hint = "the package example-robot-data is not installed", "pip install example-robot-data"
         raise ModelError(what, where=f"package:{robot}", allowed="package:NAME if it is installed", hint=hint)
-    files = _urdf_files(folder)
-    stem = robot.lower().removesuffix(".urdf")
+    files, stem = _urdf_files(folder), robot.lower().removesuffix(".urdf")
     stem = {"ur5": "ur5_robot", "ur10": "ur10_robot"}.get(stem, stem)
     found = [robot] if robot in files else [name for name, path in files.items() if path.stem.lower() == stem]
     found = [name for name in found if name == f"{stem}_description/urdf/{stem}.urdf"] or found

@@ -538,7 +538,7 @@ class _RelinearizingSearch:
             step = linearized_residual.size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
             length = linearized_residual.step_norm_in_stds(now, step)
             if length < _LAST_STEP_STDS:
-                return ended(Status.CONVERGED, "the last step is below a hundredth of a standard deviation")
+                return ended(Status.CONVERGED, "the estimates no longer change")
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
             along, whole = now.jacobian @ moved, now.jacobian @ step
             if np.any(along):
