@@ -222,8 +222,7 @@ def test_check(carried_out, pendulum):
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
-    agrees = "inverse dynamics of the built model and double_pendulum.urdf as read agree with those of the library"
-    assert agrees in " ".join(done.out.split())
+    assert "inverse dynamics of the built model and double_pendulum.urdf as read agree" in done.out
 
 
 def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):

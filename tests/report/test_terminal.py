@@ -83,10 +83,10 @@ def test_a_verdict_reads_alike_in_every_command(said):
 def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved())
     assert lines[0].startswith("Use these values within their ±: p_identifiable. 1 of 4 free")
-    assert "These recordings do not determine the following parameters: p_not_identifiable." in " ".join(lines)
+    size, text = "chi2 per degree of freedom is 1.03; noise alone gives 1", " ".join(lines)
+    assert "These recordings do not determine the following parameters: p_not_identifiable." in text
     assert "These parameters are only weakly determined, so use the 95 % interval: p_weak." in lines
-    size = "chi2 per degree of freedom is 1.03; noise alone gives 1"
-    assert f"The model explains the recordings to within their noise ({size})." in " ".join(lines)
+    assert f"The model explains the recordings to within their noise ({size})." in text
     assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
     assert not any("p_fixed" in line for line in lines)
@@ -148,9 +148,8 @@ def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(
     entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:15]))
-    leads = "Use these values within" in text, "1.8 mm" in text.partition("parameter  ")[0]
-    assert leads == (fit is GOOD and error < 6 * noise, bool(said))
-    assert said is None or said in text
+    assert ("Use these values within" in text) == (fit is GOOD and error < 6 * noise)
+    assert ("1.8 mm" in text.partition("parameter  ")[0], (said or "") in text) == (bool(said), True)
 
 
 def test_an_interval_is_shown_of_every_number_that_is_known():

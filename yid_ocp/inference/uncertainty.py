@@ -194,8 +194,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
-    sums = np.array([slopes.T @ errors for slopes, errors in clusters])
-    adjusted = []
+    sums, adjusted = np.array([slopes.T @ errors for slopes, errors in clusters]), []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
         # directions that no other cluster informs cannot be corrected

@@ -322,8 +322,8 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     place, asked = ", ".join(f"{x:.4g}" for x in result["place"]), 1e3 * result["tolerance"]
     yield (
         f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
-        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s ({asked:g} mm is "
-        f"tolerated). No point of the object is then faster than {1e3 * result['swing']:.3g} mm/s."
+        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s (position_tolerance: "
+        f"{asked:g} mm). No point of the object is then faster than {1e3 * result['swing']:.3g} mm/s."
     )
     if result["off_path"] is not None:
         yield f"During the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints."
@@ -413,7 +413,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         yield SummaryTable(rows, f"Frequencies by {head}")
-    yield f"Natural frequencies: {convergence['message']}" if convergence["message"] else ""
+    yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
     if is_far:
         far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
         far += "This is usual before a fit. `solve` also tests links and time step, which say little before the fit."
@@ -548,14 +548,14 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
     rows: TableRows = [("point", "images", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
-        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Points", is_key_table=True)
     good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
     used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
+    yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
         names = [own["name"] for own in result["frames"] if own["reason"].partition(":")[0] == why]
         yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."

@@ -188,7 +188,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}")
-        elif tried:
+        elif any(own["std"] is not None for own in tried.values()):
             is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
             end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")
             said.append(f"With {words}, no estimate would change by more than its ± from the recordings{end}")

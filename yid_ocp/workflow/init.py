@@ -198,6 +198,10 @@ def _summary_lines(
     lines += [f"model.damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
     told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
     lost = [f"warning: {text}" for text in told if "`init` leaves out" in text]
+    for group, own in proposal.point_placements.items() if proposal.has_object else ():
+        if "." not in group and own and not any(place.frame for place in own):
+            frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
+            lost.append(f"warning: `check` will stop, because no point of {group} has a frame. Set {frames} or {use}")
     lines = [*lost, "`init` chose:", *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
