@@ -589,7 +589,8 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows)
+    untested = "The file was not tested, because its replay in MuJoCo compares no channel of these recordings."
+    yield SummaryTable(rows) if gate["channels"] else untested
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):

@@ -219,10 +219,8 @@ class SingleShooting(base.SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
-        words = {
-            0: "the cost no longer falls",
-            1: f"no convergence. Set solver.max_iterations: {2 * self.max_iterations}",
-        }
+        limit = f"the search reached its limit. Set solver.max_iterations: {2 * self.max_iterations}"
+        words = {0: "the cost no longer falls", 1: limit}
         message = words.get(result.status, f"no minimum was found ({result.message}). Use gauss_newton")
         return recorder.solver_result_with_iterates(status, message, best.x, warm)
 
