@@ -63,7 +63,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from misfit_summary_blocks(result["fit"], free)
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap: " in text for text in predicted)
         said = goodness_of_fit_message(result["fit"]["chi2_per_dof"], True) if result["fit"]["explains"] else ""
-        texts = (*_found_and_lost(free, is_safe), said, *notes, *predicted)
+        found, doubts = (*_found_and_lost(free, is_safe), said), (*notes, *predicted)
+        texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
@@ -589,8 +590,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    untested = "The file was not tested, because its replay in MuJoCo compares no channel of these recordings."
-    yield SummaryTable(rows) if gate["channels"] else untested
+    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
