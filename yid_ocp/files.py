@@ -36,8 +36,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     """
     allowed = "the path of a readable file"
     try:
-        info = path.stat()
-        readable = os.access(path, os.R_OK)
+        info, readable = path.stat(), os.access(path, os.R_OK)
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
         absent = isinstance(error, FileNotFoundError)
         what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"

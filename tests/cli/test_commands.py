@@ -222,8 +222,7 @@ def test_check(carried_out, pendulum):
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
-    agrees = "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics agree with those of the library"
-    assert agrees in done.out
+    assert "inverse dynamics of the built model and double_pendulum.urdf as read agree" in done.out
 
 
 def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):
@@ -232,7 +231,7 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
         del file["joints"].attrs["effort_kind"]
     result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
     [said] = [text for text in result["warnings"] if "effort_sampling_kind" in text]
-    assert said.startswith("'untold' does not state")
+    assert said.startswith("in 'untold', nothing states")
     assert "so they are taken as samples" in said
 
 
@@ -251,7 +250,7 @@ def test_check_refines_links_and_time_step(carried_out, written):
     coarsest, finest = (row["hertz"][0] for row in convergence["links"])
     assert abs(finest - exact) < 0.05 * exact
     assert abs(finest - exact) < abs(coarsest - exact)
-    assert "warning: natural frequency" in done.out
+    assert "warning: natural frequencies change by more than 2 % when" in done.out
 
 
 def test_inspect(carried_out, pendulum, tmp_path):
@@ -347,7 +346,7 @@ def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(printed, tmp
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
     told = printed("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
     assert "is not compared" not in told
-    assert "the built model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio" in told
+    assert "Mass matrix, weight and inverse dynamics of the built model agree with those of the library" in told
 
 
 def test_what_is_simulated_is_exported_and_imported(printed, pendulum_data, tmp_path):

@@ -65,6 +65,8 @@ def solve(
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
     text = f"solving for {len(problem.initial_unknowns)} unknowns by {solver.name}"
+    if problem.options.weighting != "paper":
+        text += f" (noise alone gives a cost near {problem.residual_rows.data.stop / 2:.4g})"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
     safe = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)

@@ -235,8 +235,7 @@ def step_jacobian_sparsity_patterns(symbols: NamedStepEquations) -> dict[str, Sp
     """
     whole = ca.DM.ones(symbols.full_jacobian_sparsity_pattern).full() > 0
     system = symbols.equations.system
-    free = list(system.unprescribed_coordinate_indices)
-    joints = system.mechanism.joint_names
+    free, joints = list(system.unprescribed_coordinate_indices), system.mechanism.joint_names
 
     def block(row: str, column: str) -> BoolArray:
         return whole[symbols.row_or_column_block_slice(row), symbols.row_or_column_block_slice(column)]

@@ -109,8 +109,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
 
 def _low_rank_error_sensitivity(course: NominalTrajectory, errors: TorqueAndAngleErrorModel, slopes: Array) -> Array:
     """Return sensitivities (N + 1, k, q) of k readings to q unit-variance unknowns that represent all input errors."""
-    motion = _Motion(course, errors)
-    rng = np.random.default_rng(0)
+    motion, rng = _Motion(course, errors), np.random.default_rng(0)
     shape, most = slopes.shape[:2], min(_MAX_RANDOM_SAMPLES, motion.size, slopes.shape[0] * slopes.shape[1])
     count = min(_INITIAL_RANDOM_SAMPLES, most)
     while True:

@@ -44,8 +44,7 @@ def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
     """Create the nominal trajectory of a recording from its prediction at the parameters `theta`."""
-    own = predictor.theta_with_episode_values(episode, theta)
-    rest = result.equilibrium
+    own, rest = predictor.theta_with_episode_values(episode, theta), result.equilibrium
     sizes = predictor.integrator_step.sizes
     by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
     if rest is not None:
@@ -149,8 +148,7 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
-    rows = problem.residual_rows
-    units = np.ones(len(evaluation.residual))
+    rows, units = problem.residual_rows, np.ones(len(evaluation.residual))
     units[rows.data] = problem.stated_rms_noise_of_data_residuals
     units = units[kept := rows.slice_of_data_and_stated_priors]
     return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]

@@ -558,8 +558,7 @@ def gap_locations_from_closures_and_smoother(
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
     for place in rest:
         share[place.location] = share.get(place.location, 0.0) + left * place.gap_share
-    total = sum(share.values())
-    found = []
+    total, found = sum(share.values()), []
     for location in dict.fromkeys([*share, *known]):
         first = known.get(location, GapLocation(location, 0.0, False, ()))
         own = replace(first, gap_share=share.get(location, 0.0) / total if total > 0 else 0.0)

@@ -137,8 +137,7 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
     measured = {joint for samples in course.episode.measurements for joint in samples.sensor.effort_joints}
     silent = {joint_names[i] for i in course.system.prescribed_coordinate_indices} - measured
     names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
-    forced = np.array([joint_names.index(name) for name in names], int)
-    load = _loads(course)
+    forced, load = np.array([joint_names.index(name) for name in names], int), _loads(course)
     of_place: dict[str, list[float]] = {}
     for name, index in zip(names, forced, strict=True):
         of_place.setdefault(place[name], []).append(load[index])
@@ -157,8 +156,7 @@ def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str
 def _loads(course: _LinearizedEpisode) -> Array:
     """Root mean square load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
-    load = np.zeros(system.n_coordinates)
-    q = rollout.state[:, : system.n_coordinates]
+    load, q = np.zeros(system.n_coordinates), rollout.state[:, : system.n_coordinates]
     springs = [(system.mechanism.joint_index(s.joint_name), s) for s in system.elastic_joints]
     if springs:
         symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest_angle) for _, s in springs))

@@ -194,8 +194,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
-    sums = np.array([slopes.T @ errors for slopes, errors in clusters])
-    adjusted = []
+    sums, adjusted = np.array([slopes.T @ errors for slopes, errors in clusters]), []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
         # directions that no other cluster informs cannot be corrected
@@ -365,8 +364,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
-    joint = problem.options.multivariate_prior
-    known = dict(problem.options.prior_stds)
+    joint, known = problem.options.multivariate_prior, dict(problem.options.prior_stds)
     known |= dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)), strict=True))
     found = {}
     for entry in (e for e in entries if e.name in (*problem.shared_parameters, *problem.local_parameters)):

@@ -130,8 +130,7 @@ class WhiteningFilter:
         """Innovations of some steps, and the mean after them. With torque noise `white`, also the mean before each."""
         noise, known = self.input_error_model.torque_noise, None
         if push is not None and part.first < len(push):
-            known = push[part.first : part.first + len(part.kalman.moves)]
-            own = own.copy()
+            known, own = push[part.first : part.first + len(part.kalman.moves)], own.copy()
             for first in range(0, len(own), _ROWS_PER_BLOCK):
                 rows = slice(first, first + _ROWS_PER_BLOCK)
                 own[rows] -= np.einsum("ru,ruc->rc", part.by_torque[rows], push[part.step_of_row[rows]])
@@ -148,8 +147,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: TorqueAndAngleErr
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     seen, disturbed = np.any(slopes.by_state != 0, axis=(0, 1)), np.any(np.abs(start) > _MIN_START_SLOPE, axis=1)
     live = reachable_and_observable_state_mask(step, course.theta, course.rollout, seen=seen, disturbed=disturbed)
-    kept = np.flatnonzero(live)
-    order = np.argsort(slopes.node, kind="stable")
+    kept, order = np.flatnonzero(live), np.argsort(slopes.node, kind="stable")
     rows_of_node = np.split(order, np.searchsorted(slopes.node[order], np.arange(1, count + 1)))
     slopes = slopes.select_states(kept)
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
@@ -406,8 +404,7 @@ def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLik
     """
     x, found = np.asarray(x, float), list[tuple[Array, Array] | None]()
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
-        whitening = _own_filter(own)
-        parts = problem.unpack_episode_unknowns(x, i)
+        whitening, parts = _own_filter(own), problem.unpack_episode_unknowns(x, i)
         result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)

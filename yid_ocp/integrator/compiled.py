@@ -303,8 +303,7 @@ def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names:
         what, where = "the C compiler failed on the code for parameter derivatives", "the environment variable CC"
         hint = "set CC to another compiler, such as gcc or clang, or to none (slower)"
         raise ModelError(what, where=where, allowed="a working C compiler, or none", hint=hint)
-    function = ca.external("by_theta", library._name)
-    sizes = model.sizes
+    function, sizes = ca.external("by_theta", library._name), model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])
     shapes = [function.size_out(i) for i in range(function.n_out())]
     if shapes != [(count, len(names)) for count in rows]:

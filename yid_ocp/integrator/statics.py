@@ -126,8 +126,7 @@ class EquilibriumSolver:
             if converged and guess is not None:
                 best = (False, 0.0, error, w)
                 break
-            inner = w[count - nz : count]
-            placed = ca.DM(self._configuration(w, given))
+            inner, placed = w[count - nz : count], ca.DM(self._configuration(w, given))
             energy = float(self._energy(placed, inner, hold, theta)) if converged else error
             if best is None or (not converged, energy) < best[:2]:
                 best = (not converged, energy, error, w)
@@ -148,8 +147,7 @@ class EquilibriumSolver:
         message = self._explain(state, theta, error) if failed else "at rest"
         by_itself = bool(system.servos) and torque is not None
         if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > _MAX_HOLD_DEFLECTION:
-            joint = int(np.argmax(np.abs(give)))
-            failed = True
+            joint, failed = int(np.argmax(np.abs(give))), True
             # with a torque, any of the three starts may lead to a wrong equilibrium
             cause = "the grasp" if torque is None else "the measured torques and the grasp"
             limit = f"at most {_MAX_HOLD_DEFLECTION:g} rad is tolerated"

@@ -58,8 +58,7 @@ def _example_robot_urdf(robot: str) -> Path:
     if folder is None:
         what, hint = "the package example-robot-data is not installed", "pip install example-robot-data"
         raise ModelError(what, where=f"package:{robot}", allowed="package:NAME if it is installed", hint=hint)
-    files = _urdf_files(folder)
-    stem = robot.lower().removesuffix(".urdf")
+    files, stem = _urdf_files(folder), robot.lower().removesuffix(".urdf")
     stem = {"ur5": "ur5_robot", "ur10": "ur10_robot"}.get(stem, stem)
     found = [robot] if robot in files else [name for name, path in files.items() if path.stem.lower() == stem]
     found = [name for name in found if name == f"{stem}_description/urdf/{stem}.urdf"] or found
@@ -335,7 +334,7 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
     """Names of joints that follow others (`mimic`). They are added to `locked`, because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
-    following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
+    following, still = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}, list[str]()
     for name, mimic in following.items():
         if wanted is not None and name in wanted:
             what = f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own"
@@ -346,10 +345,13 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
             raise ModelError(what, where=where, **unknown_name_error_arguments(str(mimic.joint), joints))
         if name in locked:
             continue
-        if wanted is None or mimic.joint in wanted:
-            what = "%s: joint '%s' follows '%s' (mimic). Couplings are not modelled, so '%s' does not move in the model"
-            log.warning(what, Path(where).name, name, mimic.joint, name)
+        still += [f"'{name}' follows '{mimic.joint}'"] if wanted is None or mimic.joint in wanted else []
         locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
+    if still:
+        what = (
+            "%s: couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model: %s"
+        )
+        log.warning(what, Path(where).name, ", ".join(still))
     return set(following)
 
 

@@ -112,7 +112,7 @@ def plan_informative_motion(
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
     for i, (begin, _) in enumerate(begins):
-        progress.begin_stage(f"improving the motion, start {i + 1} of {len(begins)}")
+        progress.begin_stage(f"improving random motion {i + 1} of {len(begins)}")
         found.append(search.improve_motion(begin, options.max_iterations, progress))
     return _plan(experiment, limits, search, criterion, found, rivals, unseen)
 
@@ -284,7 +284,7 @@ def _plan(
     w, rounds, message = chosen.w, count_with_noun(chosen.n_iterations, "round"), "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:
         way = "For a better one, lower plan.limits, or set another plan.start_joint_positions"
-        message = f"the search did not improve the best random motion. It may be used with the ± above. {way}"
+        message = f"the search did not improve the best random motion. It may be used with the ± of the table. {way}"
     elif not chosen.is_converged:
         message = f"plan.max_iterations ended the search ({rounds}). Use this motion, or raise the limit"
     precisions, unidentifiable = _parameters(experiment, w)

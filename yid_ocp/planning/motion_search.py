@@ -419,7 +419,7 @@ class InformativeMotionSearch:
                     radius = min(2.0 * radius, _MAX_TRUST_RADIUS) if np.abs(step).max() > 0.9 * radius else radius
                     break
                 radius = max(0.3 * radius, 0.5 * _MIN_TRUST_RADIUS)
-            progress.report_parts_done(done, rounds, f"information raised by {value - first:.3g} nat")
+            progress.report_parts_done(done, rounds, f"information raised from {first:.3g} to {value:.3g} nat")
             # if no step has any gain, the criterion is not smooth enough to be improved, as for a snapping object
             finished = gained < _MIN_GAIN and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:

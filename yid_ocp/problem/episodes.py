@@ -279,8 +279,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
     """Shorten an episode to its first `steps` steps and the measurements in them."""
-    steps = min(steps, episode.grid.steps)
-    samples = []
+    steps, samples = min(steps, episode.grid.steps), []
     for entry in episode.measurements:
         last = min(entry.predictable_nodes[1], steps - (episode.grid.steps - entry.predictable_nodes[1]))
         early = entry.node + entry.fraction <= last + 1e-9

@@ -237,8 +237,7 @@ def stated_prior_stds_of_unknowns(
     `inertia` returns the mass matrix diagonal of named joints, which converts a velocity std to a momentum std. An
     effect's internal coordinate has a uniform prior within its limits, and the std of this uniform prior is returned.
     """
-    limits = _unobserved_state_limits(system)
-    stds = []
+    limits, stds = _unobserved_state_limits(system), []
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     known = dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
     for name in unknowns.unknown_names:

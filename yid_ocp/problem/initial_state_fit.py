@@ -182,8 +182,7 @@ class InitialStateFitter:
         by_q, pull = self._load(q, q, *none, theta, self.step.time_step)
         at = [index for index, _ in self._presets]
         weight = 1 / np.sqrt(np.maximum(stiffness[at], 1e-12))
-        free = np.array(by_q).ravel()[at]
-        columns = np.array(ca.densify(pull))[:, at].T
+        free, columns = np.array(by_q).ravel()[at], np.array(ca.densify(pull))[:, at].T
         reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
         load = free + columns @ reaction
         angle_suffix, load_suffix = INITIAL_ANGLE_AND_TORQUE_SUFFIXES
@@ -206,8 +205,7 @@ class InitialStateFitter:
         lower, upper = self.step.system.parameters.lower_and_upper_bounds(self.fitted_parameters)
         q, theta = guess.copy(), task.theta.copy()
         theta[index] = values
-        wanted = index[: task.wanted]
-        span = (upper - lower)[: task.wanted]
+        wanted, span = index[: task.wanted], (upper - lower)[: task.wanted]
         turns = np.abs(span - 2 * np.pi) < 1e-9  # an angle is periodic, other parameters stop at their bounds
 
         def spread(x: Array) -> tuple[Array, Array]:

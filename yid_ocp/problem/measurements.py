@@ -287,8 +287,7 @@ def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[Sensor
     """
     parts = [s.weight[:, :, None] * s.output_changes_per_bias_and_clock_std for s in samples]
     count, before = sum(part.shape[2] for part in parts), 0
-    found = np.zeros((sum(s.n_residuals for s in samples), count))
-    rows = 0
+    found, rows = np.zeros((sum(s.n_residuals for s in samples), count)), 0
     for s, part in zip(samples, parts, strict=True):
         own = s.decorrelate_residual_rows(part[s.positive_weight_mask])
         found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own

@@ -56,8 +56,7 @@ class ZeroPhaseLowPassFilter:
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         response = self._response(step)
-        rate = np.gradient(response, step)
-        second = np.zeros_like(response)
+        rate, second = np.gradient(response, step), np.zeros_like(response)
         second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 

@@ -188,8 +188,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
     """Return joints, tips and points of a system at configurations q (F, n), and the sticks between them."""
     system, tree = told.system, told.system.mechanism
     (symbols, kinematics), names = system.symbols_and_kinematics, tree.joint_names
-    owned = _link_radii(system, told.theta)
-    origins = list(kinematics.joint_origins)
+    owned, origins = _link_radii(system, told.theta), list(kinematics.joint_origins)
     pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
     points: dict[str, int] = {}
     acting = [_acting_place(system, location) for _, location, *_ in told.acting]
@@ -202,8 +201,7 @@ def _model_motion(told: ConfigurationTrajectory, t: Array, q: Array) -> _Animate
         points |= {name: len(origins) - 1} if name in system.point_frames else {}
         if frame.joint_index >= 0 and (name not in acting or name in shown):
             pairs.append((frame.joint_index, len(origins) - 1, names[frame.joint_index] in owned))
-    base = len(origins)
-    inputs = [symbols, system.parameters.symbols]
+    base, inputs = len(origins), [symbols, system.parameters.symbols]
     places = MappedFunction(ca.Function("places", inputs, [ca.horzcat(*origins, ca.SX(3, 1))]), (1,), False)
 
     def positions(q: Array) -> Array:

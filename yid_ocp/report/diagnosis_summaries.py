@@ -233,9 +233,18 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
+    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
+    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
+    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
+    if (alike := result["history"]) is not None:
+        drifted, wrong = _drifted_and_distrusted(alike)
+        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
+        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
+        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
+    yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
-    spread: TableRows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
+    spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
     for name in names:
         values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
         if len(values) > 1:
@@ -245,20 +254,11 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
-    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
-    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
-    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
-    if (alike := result["history"]) is not None:
-        yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
-        drifted, wrong = _drifted_and_distrusted(alike)
-        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
-        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
-    yield from (SummaryStatement(text, "verdict") for text in said)
+    yield from () if alike is None else _consistency_blocks(alike)
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
-    yield "run", "status", "chi2/n", "effects", *heads.values(), "time"
+    yield "run", "status", "chi2/n (noise alone: 1)", "effects", *heads.values(), "time"
     for entry in runs:
         cells = []
         for own in (entry["parameters"].get(name, {"value": None}) for name in heads):
@@ -359,23 +359,27 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 @register_summary("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = [entry["name"] for entry in result["runs"]]
-    rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
+    rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p", "verdict")]
     for name, entry in result["parameters"].items():
         own = entry["values"]
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield SummaryTable([*_consistency_rows(result)], "Runs")
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
+    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield from _consistency_blocks(result)
 
 
-def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "run", "chi2 of difference from the others", "degrees of freedom", "p", "largest in", "model explains it", ""
+def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    heads = "chi2 of difference from the others", "degrees of freedom", "p", "largest in", "explained by model"
+    rows: TableRows = [("run", *heads, "verdict")]
     for entry in history["runs"]:
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
-        yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
+        verdict = "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
+        rows.append((entry["name"], *apart, *verdict))
+    yield SummaryTable(rows, "Each run against the others")
+    yield "A run that agrees has a chi2 near its degrees of freedom. p: probability that noise alone differs as much."
 
 
 def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
@@ -394,7 +398,8 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')})."
+        limit = f"below {result['level'] / len(result['parameters']):.2g} is a change"
+        yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         yield f"Do not trust {' and '.join(wrong)}, because the others agree much better without it."
     elif drifted:
@@ -408,7 +413,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 @register_summary("yid-overlay/1")
 def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     first, second = result["runs"]
-    rows: TableRows = [("parameter", first, second, "difference", "in std", "unit")]
+    rows: TableRows = [("parameter", first, second, "difference", "difference / std", "unit")]
     differing = []
     for name, entry in result["parameters"].items():
         apart, over = entry["difference"], entry["difference_in_std"]
@@ -416,6 +421,10 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells += ["" if size is None else f"{size:+.{digits}g}" for size, digits in ((apart, 3), (over, 2))]
         rows.append((name, *cells, entry["unit"]))
         differing += [name] if over is not None and abs(over) > _MAX_RUN_DIFFERENCE else []
+    names = f"These parameters differ by more than {_MAX_RUN_DIFFERENCE} std: {abbreviated_names_text(differing)}."
+    none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
+    yield SummaryStatement(names if differing else none, "verdict")
+    yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
     where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"
@@ -426,11 +435,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
         text = f"On {where}, the rms error of {group} is {texts[0]} in {first} and {texts[1]} in {second}"
         yield SummaryStatement(f"{text}. The predictions of the two runs differ by {texts[2]} (rms).", "conclusion")
-    names = f"These parameters differ by more than {_MAX_RUN_DIFFERENCE} std: {abbreviated_names_text(differing)}."
-    none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
-    yield SummaryStatement(names if differing else none, "verdict")
-    yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
-    rows = [("recording", "channel", first, second, "difference", "unit")]
+    rows = [("recording", "channel (rms error)", first, second, "difference of predictions", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])
         errors = [value_text_and_display_unit(size, entry["unit"]) for size in three]

@@ -48,6 +48,7 @@ _MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's er
 _MAX_INITIAL_MISFIT = 30.0  # rms error at initial values, in stds of noise, up to which `check` shows finer models
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
+_CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
@@ -55,42 +56,45 @@ _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an eq
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed, converged = result["status"] == "failed", result["status"] == "converged"
-    if not failed:
-        said = "The fit did not converge. Its misfit and verdicts hold at its last values, not for the recordings."
-        yield from misfit_summary_blocks(result["fit"], free) if converged else [SummaryStatement(said, "conclusion")]
-        yield from (SummaryStatement(text, "conclusion") for text in result.get("discretisation_notes", ()))
-        yield from (SummaryStatement(text, "conclusion") for text in _prediction_sentences(result))
-    yield from issue_summary_blocks(result)
-    rows: TableRows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")]
+    issues, is_trusted = issue_summary_blocks(result), result["fit"]["data_trusted"]
+    yield from () if is_trusted else issues
+    if converged:
+        predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
+        yield from misfit_summary_blocks(result["fit"], free)
+        is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap: " in text for text in predicted)
+        said = goodness_of_fit_message(result["fit"]["chi2_per_dof"], True) if result["fit"]["explains"] else ""
+        found, doubts = (*_found_and_lost(free, is_safe), said), (*notes, *predicted)
+        texts = (*found, *doubts) if is_safe else (*doubts, *found)
+        yield from (SummaryStatement(text, "conclusion") for text in texts)
+    else:
+        said = "the fit failed" if failed else "the fit did not converge"
+        said = f"Do not use the values, because {said}: {result['message'].removesuffix('.')}."
+        said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
+        yield SummaryStatement(said, "conclusion")
+    yield from issues if is_trusted else ()
+    shown, heads = "value" if converged else "last value", ("± std", "95 % interval", "unit", "verdict", "start")
+    rows: TableRows = [("parameter", shown, *heads, "bounds")]
     for name, entry in free.items():
-        std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
-        interval = "" if failed else _interval_cell(entry, entry["std"])
-        verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
-        value = value_and_uncertainty_text(entry["value"], None, verdict=None if failed else entry["verdict"])
-        own = (name, value, std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
-        rows.append((*own, bound_range_text(entry, 4)))
+        verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
+        std = "" if not converged or entry["std"] is None or verdict == "at_bound" else f"{entry['std']:.2g}"
+        interval = _interval_cell(entry, entry["std"]) if converged else ""
+        own = ("–" if verdict == "not_identifiable" else value, std, interval, entry["unit"])
+        said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
+        rows.append((name, *own, said, f"{entry['initial']:.4g}", bound_range_text(entry, 4)))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    rows = [("channel", "error (rms)", "unit", "samples")]
+    rows = [("fitted channel", "error (rms)", "unit", "samples")]
     for name, entry in result["residuals"].items():
         rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
     yield SummaryTable(rows, "Errors on the fitted recordings")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
     yield from discretisation_shift_sentences(result)
-    if failed:
-        said = "The fit failed, so do not use the values. They are the best that were reached, without a known ±."
-        yield SummaryStatement(f"{said} If a simulation failed, {FAILED_ROLLOUT_ADVICE}.", "verdict")
-    else:
-        texts = *(_found_and_lost(free) if converged else ()), unused_efforts_sentence(result)
-        yield from (SummaryStatement(text, "verdict") for text in texts)
-        if result["fit"]["explains"]:
-            yield SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion")
-    yield from copyable_estimates_blocks(result)
+    yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
+    yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all" * (result["status"] == "iteration_limit")
-    steps += f" ({result['seconds']:.1f} s)" + ", so do not use the values" * (result["status"] == "stalled")
-    ended = f"{result['status'].replace('_', ' ')} after {steps}: {result['message']}"
-    yield SummaryStatement(ended, "note" if converged else "conclusion")
+    ended = f"{result['status'].replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
+    yield f"{ended}: {result['message']}" if converged else f"{ended}. Do not use the values."
 
 
 def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
@@ -126,17 +130,18 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         errors = (error, fitted, noise, guesses.get(best or ""))
         sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
         guess = f" The guess that {_BASELINE_DESCRIPTIONS.get(best, best)} gives {sizes[3]}." if best else ""
-        text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
         if noise is None or error is None or fitted is None:
             continue
         is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
+        text, rest = f"its rms error is {sizes[0]} on held-out recordings", f"On fitted ones it is {sizes[1]}.{guess}"
         if not result["fit"]["explains"]:
+            text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
             yield f"{text} Noise alone gives {sizes[2]}.{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
-            yield f"{text} Noise alone gives {sizes[2]}, less than half, so there is a gap. {advice}{guess}"
+            yield f"{group} shows a gap: {text}, over twice the {sizes[2]} that noise alone gives. {advice} {rest}"
         elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{text} Stated torque noise gives {sizes[2]}. An error up to twice this shows no gap.{guess}"
+            yield f"{group} shows no gap: {text}, at most twice the {sizes[2]} that noise alone gives. {rest}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -172,7 +177,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"For comparison, the last column has the rms errors of guesses: {legend}." if legend else ""
+    yield f"The last column has the rms error of guesses for comparison: {legend}." if legend else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -187,14 +192,16 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     return [channel for channel in errors if channel not in hidden]
 
 
-def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool) -> Iterator[str]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
     found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
-        yield f"{text} (near zero: of a typical value): {abbreviated_names_text(found)}."
+        text, names = f"{text} (near zero: of a typical value)", abbreviated_names_text(found)
+        yield f"Use these values within their ±: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
-        yield f"These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
+        text = f"These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
+        yield f"{text} `yid-ocp identifiability FILE --what-if` lists experiments that determine more."
     if weak:
         yield f"These parameters are only weakly determined, so use the 95 % interval: {abbreviated_names_text(weak)}."
         if any(free[name]["interval"] is None for name in weak):
@@ -295,27 +302,29 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    rows: TableRows = [("joint", "travel [rad or m]", "velocity / limit", "effort / limit")]
+    message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
+    done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
+    said = done if result["status"] == "done" else f"Do not use this motion: {message}."
+    yield SummaryStatement(said.replace("Do not use this motion", "Not finished") if is_usable else said, "conclusion")
+    parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
+    yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
+    rows: TableRows = [("joint", "travel [rad or m]", "largest velocity / limit", "largest effort / limit")]
     for name, own in result["joints"].items():
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
-    yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
-    is_usable = result["status"] == "failed" and result["goal"] == "information"
-    yield SummaryStatement(f"{'not finished' if is_usable else result['status']}: {result['message']}", "conclusion")
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["error"] is None or result["swing"] is None:
         yield "Do not use this motion, because the model cannot simulate it to its end."
         return
-    place = ", ".join(f"{x:.4g}" for x in result["place"])
+    place, asked = ", ".join(f"{x:.4g}" for x in result["place"]), 1e3 * result["tolerance"]
     yield (
         f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
-        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s, and no point of the "
-        f"object is then faster than {1e3 * result['swing']:.3g} mm/s."
+        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s (position_tolerance: "
+        f"{asked:g} mm). No point of the object is then faster than {1e3 * result['swing']:.3g} mm/s."
     )
     if result["off_path"] is not None:
         yield f"During the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints."
@@ -325,7 +334,7 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
-        yield "The uncertainty of the position is unknown. For it, set plan.parameter_run_folder to a `solve` run."
+        yield "The uncertainty of the position is unknown. To get it, set plan.parameter_run_folder to a `solve` run."
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -334,7 +343,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield "Expected ± of each parameter (up to 10 % of its value counts as found):"
+    found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
+    count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
+    said = (
+        f"A recording of this motion would determine {count} to within 10 % of their value: {names}." if found else ""
+    )
+    yield f"{said or 'No parameter would be known to within 10 %.'} The table has the expected ±."
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -342,12 +356,13 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f", which ended at {gains[-1]:.3g} to {gains[0]:.3g} nat" if len(gains) > 1 else ""
-    more = f" It is the best of {len(starts)} searches from random motions{others}." if len(starts) > 1 else ""
-    gain = f"{best['value'] - best['first']:.3g} nat (0.7 nat halves one standard deviation)"
-    yield f"The search raised the information of the motion by {gain}.{more}" if best["value"] > best["first"] else ""
-    reached = [f"the {k.partition(' [')[0]} limit of {', '.join(n)}" for k, n in result["limits_reached"].items()]
-    yield f"The motion reaches {' and '.join(reached) or 'none of its limits'}."
+    others = f", with {gains[0]:.3g} nat (the others: {gains[-1]:.3g} to {gains[1]:.3g} nat)" if len(gains) > 1 else ""
+    more = f" Judged by the configured model, it is the best of {len(starts)} searches{others}." * (len(starts) > 1)
+    gain = f"from {best['first']:.3g} to {best['value']:.3g} nat (0.7 nat more halves one standard deviation)"
+    yield f"The search raised the information of the motion {gain}.{more}" if best["value"] > best["first"] else ""
+    reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
+    text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
+    yield f"The motion reaches {text}."
     for words in dict.fromkeys(result["unseen"].values()):
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
         yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
@@ -362,9 +377,21 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     model = result["model"]
     driven = f"{model['nu']} driven and {model['nc']} prescribed joints"
     size = [count_with_noun(model[key], noun) for key, noun in (("n", "coordinate"), ("m", "constraint"))]
+    issues, warnings = result.get("issues"), [*result["warnings"]]
+    misfit, moved = result["initial_misfit"], discretisation_shift_sentences(result)
+    is_far = misfit is not None and misfit > _MAX_INITIAL_MISFIT
+    warnings += [] if is_far else result["convergence"]["warnings"]
+    ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
+    if result["recordings"]:
+        ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
+    if issues or warnings:
+        ended = f"A run is possible, but first read the {'issues' if issues else 'warnings'} below."
+    yield SummaryStatement(ended, "conclusion")
     yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
-    yield from (entry["words"] for entry in result["mechanics"].values() if entry["agrees"])
-    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
+    agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
+    same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."
+    yield same if agreed else ""
+    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (median)")]
     rests = dict[str, list[str]]()
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"
@@ -372,37 +399,36 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
             rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
         rest = entry.get("equilibrium")
-        said = [] if rest is None else ["an equilibrium was found" if rest["found"] else rest["message"]]
-        gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
+        said = [] if rest is None else ["the model is in equilibrium" if rest["found"] else rest["message"]]
+        gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
         said += ["hand and object are apart at grasp " + ", ".join(gaps)] if gaps else []
         rests.setdefault(", and ".join(said), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
-    yield from (f"At the start of {', '.join(names)}, {said}." for said, names in rests.items() if said)
+    for text, names in rests.items():
+        which = "all recordings" if 1 < len(names) == len(result["recordings"]) else ", ".join(names)
+        yield f"At the start of {which}, {text}." if text else ""
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
-        rows = [(head, "lowest frequencies [Hz]", "")]
+        rows = [(head, "lowest natural frequencies [Hz]", "remark")]
         for row in convergence[key]:
             remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         yield SummaryTable(rows, f"Frequencies by {head}")
-    yield f"Natural frequencies: {convergence['message']}" if convergence["message"] else ""
-    misfit, moved, warnings = result["initial_misfit"], discretisation_shift_sentences(result), result["warnings"]
-    if misfit is not None and misfit > _MAX_INITIAL_MISFIT:
+    yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
+    if is_far:
         far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
-        far += "`solve` lowers it, and repeats the tests of the discretisation. They say little before (result.json)."
+        far += "This is usual before a fit. `solve` also tests links and time step, which say little before the fit."
         yield SummaryStatement(far, "verdict")
     else:
         fine = "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)"
         yield from [fine, *moved] if moved else []
-        warnings = [*warnings, *convergence["warnings"]]
     yield from issue_summary_blocks(result)
-    yield from (SummaryStatement(f"warning: {text}", "verdict") for text in warnings)
-    ended = "No problem was found, so a run is possible."
-    if not result["recordings"]:
-        ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
-    if result.get("issues") or warnings:
-        ended = f"A run is possible, but read the {'issues' if result.get('issues') else 'warnings'} above."
-    yield SummaryStatement(ended, "conclusion")
+    alike = dict[str, list[str]]()  # names of the recordings by warning
+    for text in warnings:
+        name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
+        alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
+    texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
+    yield from (SummaryStatement(f"warning: {text}", "verdict") for text in texts)
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
@@ -413,7 +439,7 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
         if known is not None and known["std"] is not None:
             words = " ".join(value_text_and_display_unit(known["std"], known["unit"]))
             offset = " ".join(value_text_and_display_unit(known.get("bias_std"), known["unit"]))
-            words += f", offset {offset}" if known.get("bias_std") else ""
+            words += f", offset ± {offset}" if known.get("bias_std") else ""
             said.append(words + (" (estimated)" if known.get("estimated") else ""))
     return "; ".join(said)
 
@@ -511,9 +537,10 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
     else:
+        said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. To use it, list it under "
+        yield SummaryStatement(f"{said}recordings.estimate of a configuration.", "verdict")
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-        yield SummaryTable([("group", "samples"), *rows], "Recorded", is_key_table=True)
-        yield SummaryStatement(f"The file recording.h5 has {result['duration']:g} s of motion.", "verdict")
+        yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
 
 
 @register_summary("yid-track/1")
@@ -522,14 +549,14 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
     rows: TableRows = [("point", "images", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
-        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Points", is_key_table=True)
     good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
     used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
+    yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
         names = [own["name"] for own in result["frames"] if own["reason"].partition(":")[0] == why]
         yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."
@@ -554,17 +581,20 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
     yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
     yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
-    gate = manifest["gate"]
-    if gate is None:
+    if (gate := manifest["gate"]) is None:
         return
     if gate["status"] != "done":
         yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
         return
-    rows = [("replayed channel", "without estimates", "exported", "noise", "unit")]
+    rows = [("replayed channel", "error (rms) without estimates", "as exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows)
+    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
+    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
+    ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
+    if worst := max(ratios, key=lambda name: ratios[name], default=""):
+        text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
+        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings."
     if gate["fall"] is not None:
-        held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
         yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

@@ -114,12 +114,12 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
             do += " by this line of the configuration:" if entry["setting"] else "."
             place = f" ({where.partition('/')[0]})" if len(alike) > 1 else ""
             advice += [f"{words}{place}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
-    yield SummaryTable(rows, "Issues of the recordings")
-    yield from advice
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
-        yield SummaryStatement(f"No value counts as found until this is corrected: {'; '.join(severe)}.", "verdict")
+        yield SummaryStatement(f"Use no value of a fit until this is corrected: {'; '.join(severe)}.", "verdict")
     if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
         yield f"These issues change no verdict. Before you use values, follow the advice on them: {'; '.join(mild)}."
+    yield SummaryTable(rows, "Issues of the recordings")
+    yield from advice
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -133,7 +133,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
         stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
-        yield f"To use these numbers, copy the lines below ({stated}):"
+        yield f"To use these numbers, copy the lines below, as text, YAML, MJCF or LaTeX ({stated}):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))
 
@@ -172,7 +172,7 @@ def misfit_summary_blocks(
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation of a fit that ended: which estimates it shifts too far."""
-    said, free = [], result["parameters"] if result["format"] == "yid-solve/1" else {}
+    said, cures, free = [], list[str](), result["parameters"] if result["format"] == "yid-solve/1" else {}
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in free.items()}
     again, wide = (", and solve again", " The ± of the table includes this.") if free else ("", "")
     kinds = {"links": "twice the links", "time_step": "half the time step"}
@@ -186,20 +186,20 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         changes = [f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
-            cure = f" To cure this, set {own}{again}." if (own := result.get("finer_settings", {}).get(key)) else ""
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}{cure}")
-        elif tried:
+            cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}")
+        elif any(own["std"] is not None for own in tried.values()):
             is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
             end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")
             said.append(f"With {words}, no estimate would change by more than its ± from the recordings{end}")
-    return said
+    return said + ([f"To reduce these errors, set {' and '.join(cures)}{again}."] if cures else [])
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
     """Return table rows of a result's torque offsets, one for each joint; only the header if there are none."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
-    rows: TableRows = [("torque offset [N m]", *shown, "expected")]
+    rows: TableRows = [("estimated torque offset [N m]", *shown, "expected size")]
     for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
         own = [entry.get(joint) for entry in shown.values()]
         cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
@@ -227,7 +227,7 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         elif block.text.endswith("."):
-            result += textwrap.wrap(block.text, _PROSE_WIDTH)
+            result += textwrap.wrap(block.text, _PROSE_WIDTH, break_on_hyphens=False)
         elif len(block.text) > _MAX_UNWRAPPED_NOTE:
             result += textwrap.wrap(block.text, _NOTE_WIDTH, subsequent_indent="  ")
         else:
@@ -237,7 +237,7 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 def recording_summary_lines(recording: Recording) -> list[str]:
     """Return lines of text that describe a recording: a table of its groups, the duration and notes."""
-    rows: TableRows = [("group", "samples", "Hz", "s", "channels", "names")]
+    rows: TableRows = [("group", "samples", "rate [Hz]", "length [s]", "channels", "names")]
     for group in recording.all_groups:
         rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
@@ -257,12 +257,12 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
 
 def importable_file_contents_lines(contents: FilePreview) -> list[str]:
     """Return lines of text that describe a file of another tool: a table of what `import` finds, and notes."""
-    rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
+    rows: TableRows = [("source", "type", "samples", "rate [Hz]", "imported as", "note")]
     alike: dict[tuple[str, ...], list[Sequence[str]]] = {}  # rows that only differ in a number
     for own in contents.sources:
         rate = f"{own.mean_rate:.4g}" if math.isfinite(own.mean_rate) else ""
         kind, _, of = own.imported_as.partition(" ")
-        becomes = f"{kind} {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "-"
+        becomes = f"{kind} {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "not imported"
         rows.append((own.name, own.kind, str(own.n_samples), rate, becomes, own.note))
         alike.setdefault(tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in rows[-1]), []).append(rows[-1])
     for group in alike.values():

@@ -288,8 +288,7 @@ def sensor_function_with_jacobians(system: System, sensor: Sensor, names: tuple[
     (at["q"], kinematics), scale = system.symbols_and_kinematics, system.recorded_time_scale
     true = (at["q"], at["v"] / scale, at["a"] / scale**2, at["z"], at["load"], at["lam"] / scale)
     state = NodeStateSymbols(system, kinematics, *true, rows, sensor.camera_pose)
-    parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
-    read = []
+    parts, read = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel), []
     marked = sensor.frame_names or (None,) * len(sensor.channel_names)
     for channel, part, frame in zip(sensor.channel_names, parts, marked, strict=True):
         for effect in system.effects:

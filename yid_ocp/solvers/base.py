@@ -425,7 +425,8 @@ class _MultiStartSearch:
 
     def _status_and_message(self) -> tuple[Status, str]:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
-        status, message = result.status, result.message + f" (best of {len(self._fits)} starts)" * (len(self._fits) > 1)
+        status, many = result.status, len(self._fits) > 1 and result.status == Status.CONVERGED
+        message = result.message + f" (best of {len(self._fits)} starts)" * many
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
             message += ". Weights and ± ignore noise of the torques or angles that move the model. Use gauss_newton"
         constant = any(episode.has_biases_treated_as_noise for episode in self._problem.episodes)
@@ -538,7 +539,7 @@ class _RelinearizingSearch:
             step = linearized_residual.size_limited_damped_step(problem, x, now.jacobian, now.residual, 1e-12)
             length = linearized_residual.step_norm_in_stds(now, step)
             if length < _LAST_STEP_STDS:
-                return ended(Status.CONVERGED, "the last step is below a hundredth of a standard deviation")
+                return ended(Status.CONVERGED, "the estimates no longer change")
             least = np.where(problem.positive_unknowns_mask, np.maximum(lower, _LEAST_FACTOR * x), lower)
             along, whole = now.jacobian @ moved, now.jacobian @ step
             if np.any(along):

@@ -104,7 +104,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                     message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                message = f"the search reached its limit (solver.max_iterations: {self.max_iterations}). Raise it"
+                message = f"the search reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 50)}"
                 return ended(base.Status.ITERATION_LIMIT, message)
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
@@ -219,7 +219,8 @@ class SingleShooting(base.SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
-        words = {0: "the cost no longer falls", 1: "no convergence. Raise solver.max_iterations"}
+        limit = f"the search reached its limit. Set solver.max_iterations: {2 * self.max_iterations}"
+        words = {0: "the cost no longer falls", 1: limit}
         message = words.get(result.status, f"no minimum was found ({result.message}). Use gauss_newton")
         return recorder.solver_result_with_iterates(status, message, best.x, warm)
 
@@ -297,5 +298,5 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, size))
-        limit = f"the search reached its limit (solver.max_iterations: {self.max_iterations})"
+        limit = f"the search reached its limit of {self.max_iterations} iterations (solver.max_iterations)"
         return ended(base.Status.ITERATION_LIMIT, f"{limit}, as is usual for this method. Use gauss_newton")

@@ -167,8 +167,8 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
             return base.Status.CONVERGED, f"IPOPT found a minimum. {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT reached its limit (solver.max_iterations: {self.max_iterations}). {closed}"
-            return base.Status.ITERATION_LIMIT, f"{limit}. Raise solver.max_iterations"
+            limit = f"IPOPT reached its limit. Set solver.max_iterations: {2 * self.max_iterations}. {closed}"
+            return base.Status.ITERATION_LIMIT, limit
         return base.Status.STALLED, f"IPOPT found no minimum ({returned}). {closed}. Use gauss_newton"
 
     def _by_condensing(
@@ -203,8 +203,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     return ended(base.Status.CONVERGED, f"the largest jump at a node (defect) is {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
-            slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
-            factor = 1.0
+            slope, factor = float(now.residual @ (now.by_defect + now.jacobian @ step)), 1.0
             while factor >= _MIN_STEP_FRACTION:
                 trial_x = np.clip(x + factor * step, *problem.bounds)
                 trial_nodes = intervals.moved(nodes, now, step, factor)
@@ -220,8 +219,8 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
                     return ended(base.Status.STALLED, f"{reason}. Set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        limit = f"the search reached its limit (solver.max_iterations: {self.max_iterations})"
-        return ended(base.Status.ITERATION_LIMIT, f"{limit}. Raise it. Largest jump at a node: {now.defect:.1e}")
+        limit = f"the search reached its limit. Set solver.max_iterations: {2 * self.max_iterations}. The largest jump"
+        return ended(base.Status.ITERATION_LIMIT, f"{limit} at a node is {now.defect:.1e}, and should be near 0")
 
 
 class _AdaptiveRidge(ca.Callback):

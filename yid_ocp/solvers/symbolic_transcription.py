@@ -187,15 +187,13 @@ def _driven_stage(
     nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
     nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
-    reference = ca.SX.sym("reference", len(index))
-    matrix = ca.reshape(gain, len(index), nu).T
+    reference, matrix = ca.SX.sym("reference", len(index)), ca.reshape(gain, len(index), nu).T
     by_errors = ca.SX(nu, 0)
     if noisy:
         # the measured momentum contains half the impulse of the previous step, whose w is replaced by that of this step
         late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
         by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
-    errors = ca.SX.sym("errors", by_errors.shape[1])
-    by_before = ca.SX(nu, nx)
+    errors, by_before = ca.SX.sym("errors", by_errors.shape[1]), ca.SX(nu, nx)
     torque = nominal + ca.mtimes(by_errors, errors)
     if index:
         torque -= ca.mtimes(matrix, before[index] - reference)
@@ -515,8 +513,7 @@ def _between(samples: SensorMeasurements, nodes: IntArray) -> scipy.sparse.csc_m
     width = samples.value.shape[1]
     sample, column = np.nonzero(samples.positive_weight_mask)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
-    fraction = samples.fraction[sample]
-    after = np.minimum(before + 1, len(nodes) - 1)
+    fraction, after = samples.fraction[sample], np.minimum(before + 1, len(nodes) - 1)
     entries = np.concatenate([1 - fraction, fraction])
     at = np.concatenate([before * width + column, after * width + column])
     matrix = scipy.sparse.csc_matrix((entries, (np.tile(row, 2), at)), shape=(len(sample), width * len(nodes)))

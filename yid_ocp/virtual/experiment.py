@@ -165,8 +165,7 @@ def recording_from_simulation(
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True)
     truth = {name: value for name, value in theta if name.rpartition(".")[2] in _TRUE_QUANTITIES}
-    made = _how_it_was_made(chosen, system)
-    joints = _joints(system, run, chosen, streams)
+    made, joints = _how_it_was_made(chosen, system), _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
     return validated_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
 

@@ -322,8 +322,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     mujoco, value, where = import_mujoco(), scene.value, f"payload@{place}"
     frame, reach = scene.system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
     body = int(model.jnt_bodyid[model.joint(scene.system.mechanism.joints[frame.joint_index].name).id])
-    turn = value(frame.placement.rotation).reshape(3, 3, order="F")
-    mass = size["mass"]
+    turn, mass = value(frame.placement.rotation).reshape(3, 3, order="F"), size["mass"]
     if not np.linalg.norm(reach) <= _MAX_INJECTED_PAYLOAD_DISTANCE * abs(mass):
         what = f"the added mass is too far, {np.linalg.norm(reach) / max(abs(mass), 1e-300):.3g} m from its frame"
         allowed = f"a distance |(mx, my, mz)/mass| of at most {_MAX_INJECTED_PAYLOAD_DISTANCE:g} m"

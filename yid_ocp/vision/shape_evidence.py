@@ -168,8 +168,7 @@ def fit_quality_and_point_classes(
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_ON_SURFACE_STDS * noise, near)
     on_shape = size < gate
-    beyond = np.zeros(len(on_shape), bool)
-    ends = np.full(len(tubes.free_end_links), np.nan)
+    beyond, ends = np.zeros(len(on_shape), bool), np.full(len(tubes.free_end_links), np.nan)
     for i, k in enumerate(tubes.free_end_links):
         ends[i], behind_tip = _end_offset(tubes, k, seen, gate)
         beyond |= behind_tip
@@ -230,8 +229,7 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
     owner = connected_components(graph, directed=False)[1]
     count = np.bincount(owner)
-    order = np.argsort(-count, kind="stable")
-    number = np.full(len(count), -1)
+    order, number = np.argsort(-count, kind="stable"), np.full(len(count), -1)
     kept = order[count[order] >= max(least, _MIN_THING_POINTS)]
     number[kept] = np.arange(len(kept))
     part[index] = number[owner]
@@ -262,8 +260,7 @@ def _coverage(
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     station = first[link] + np.minimum((along * count[link]).astype(np.int64), count[link] - 1)
     filled = np.bincount(station[own], minlength=int(count.sum())) > 0
-    owner = np.repeat(np.arange(len(count)), count)
-    bare = np.flatnonzero(~filled)
+    owner, bare = np.repeat(np.arange(len(count)), count), np.flatnonzero(~filled)
     on = owner[bare]
     share = (bare - first[on] + 0.5) / count[on]
     places = tubes.link_ends[on, 0] + share[:, None] * (tubes.link_ends[on, 1] - tubes.link_ends[on, 0])

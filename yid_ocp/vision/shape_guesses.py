@@ -208,8 +208,7 @@ class _InitialShape(NamedTuple):
 
 def add_free_root_joints(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
     """Make a system without grasps, whose object has six named free root joints (position [m], x-y-z angles)."""
-    tree = system.mechanism_with_values(values)
-    q = ca.SX.sym("q", system.n_coordinates)
+    tree, q = system.mechanism_with_values(values), ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
     place = ca.Function("root", [q], [forward_kinematics(tree, q).joint_origins[base]])(np.zeros(system.n_coordinates))
     under = np.eye(4)

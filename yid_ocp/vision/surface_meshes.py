@@ -377,8 +377,7 @@ def _mesh_of_file(file: Path, changed: int) -> TriangleMesh:
 def _resolve_mesh_path(name: str, urdf: Path) -> Path:
     """Path of a mesh file named in a URDF: `package://`, `file://`, absolute or relative to the URDF."""
     bare = name.removeprefix("file://")
-    package = bare.removeprefix("package://")
-    candidates = [Path(bare), urdf.parent / bare]
+    package, candidates = bare.removeprefix("package://"), [Path(bare), urdf.parent / bare]
     if package != bare:
         # the package's folder is the URDF's own or one above it, whether or not it still has its name
         parts = Path(package).parts
@@ -453,8 +452,7 @@ class DepthCameraModel:
         if self.noise_correlation_length > 0:
             white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
             white /= white.std()
-        chance = rng.random((4, *shape))
-        far = np.where(np.isfinite(depth), depth, 1e3)
+        chance, far = rng.random((4, *shape)), np.where(np.isfinite(depth), depth, 1e3)
         front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
         edge = back - front > self.min_relative_edge_depth * front
         mixed = edge & (chance[0] < self.edge_mixing_probability) & (back < self.max_depth)

@@ -131,7 +131,7 @@ def run_batch(
         own = {"name": member.name, "config": member.config_file, "settings": list(member.overrides)}
         more = {"inputs": inputs, "command": command, "folder": str(folder / _RUNS_FOLDER)}
         tasks.append(Task(member.name, own | more))
-    progress.begin_stage(f"{command} of {len(tasks)} runs")
+    progress.begin_stage(f"running `{command}` {len(tasks)} {'time' if len(tasks) == 1 else 'times'}")
     done = run_tasks(_run_batch_task, tasks, folder / _TASKS_FOLDER, workers, progress.report_parts_done)
     results |= {entry.name: entry for entry in done}
     entries = [_entry(results[member.name], folder) for member in members]

@@ -301,8 +301,7 @@ def _true_effect_closure(
 ) -> float | None:
     """Task: return the closure of a case by its refitted true effects; None if the fit fails or is not finite."""
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    case = _case(name, recordings, ())
-    truth = blind.CaseGroundTruth.from_dict(label)
+    case, truth = _case(name, recordings, ()), blind.CaseGroundTruth.from_dict(label)
     try:
         best = blind.true_effects_gap_closure(ensemble, case, truth, run.diagnosis.candidates)
     except YidError:

@@ -123,12 +123,12 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         if recorded < 0.5 * rate:
             said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). The motion in "
             said += f"between is interpolated. If possible, record at {0.5 * rate:.4g} Hz or more"
-            warnings.append(f"'{episode.name}' has joint samples at {said}")
+            warnings.append(f"in '{episode.name}', joints are sampled at {said}")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
             said = f"are samples, means or commands, so they are taken as {arm.effort_sampling_kind_or_default}s. If "
             said += "this is wrong, set sensors.joints.effort.effort_sampling_kind to mean or command"
-            warnings.append(f"'{episode.name}' does not state whether efforts {said}")
+            warnings.append(f"in '{episode.name}', nothing states whether efforts {said}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
@@ -249,9 +249,10 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
 
 def _warn(warnings: list[str], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row."""
-    for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False)):
-        if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE:
-            limit = f"{100 * _FREQUENCY_TOLERANCE:g} % are tolerated"
-            moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} % of the latter, {limit})"
-            change = f"natural frequency {i + 1} changes from {moved} when {when}"
-            warnings.append(f"{change}. If this vibration matters, set {remedy}")
+    moved = [
+        f"number {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
+        for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False), start=1)
+        if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
+    ]
+    said = f"natural frequencies change by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}: {', '.join(moved)}"
+    warnings += [f"{said}. If these vibrations matter, set {remedy}"] if moved else []

@@ -117,6 +117,7 @@ class _RemainingTime:
         self._begun, self.n_iterates, self._has_grown = time.monotonic(), 0, False
         self._start_of_command = self._begun - import_time
         self._first: tuple[int, float] | None = None
+        self._first_cost = math.nan
 
     def begin_stage(self, work: float, ahead: float | None) -> None:
         now = time.monotonic()
@@ -155,6 +156,13 @@ class _RemainingTime:
         # a stage that exceeds its usual time is expected to take as long again as the excess
         return abs(expected - spent) + self._ahead * pace
 
+    def iterate_text(self, entry: Iterate) -> str:
+        """Count an iterate of the stage and return its text, with the first cost of the stage."""
+        self.n_iterates += 1
+        self._first_cost = entry.cost if self.n_iterates == 1 else self._first_cost
+        cost = f"cost {entry.cost:.6g}" + f" (first {self._first_cost:.6g})" * (self.n_iterates > 1)
+        return ", ".join(filter(None, (f"iteration {entry.iteration}", cost, f"{entry.seconds:.1f} s", entry.note)))
+
     def of_parts(self, done: int, total: int) -> str:
         """Return the text of a stage's remaining time, from its done parts. Empty if the command's time is known."""
         now = time.monotonic()
@@ -168,11 +176,6 @@ def _format_duration(seconds: float) -> str:
     if seconds >= 1.5 * 3600:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.0f} min" if seconds >= 1.5 * 60 else f"{seconds:.0f} s"
-
-
-def _format_iterate(entry: Iterate) -> str:
-    parts = f"iteration {entry.iteration}", f"cost {entry.cost:.6g}", f"{entry.seconds:.1f} s", entry.note
-    return ", ".join(filter(None, parts))
 
 
 class StderrLogLinesProgress(Progress):
@@ -190,10 +193,10 @@ class StderrLogLinesProgress(Progress):
 
     def report_iterate(self, entry: Iterate) -> None:
         """Print a line for the accepted iterate; after the usual number of iterates, only every five seconds."""
-        self._left.n_iterates += 1
+        told = self._left.iterate_text(entry)
         if self._left.n_iterates <= _USUAL_ITERATIONS or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
             self._last = time.monotonic()
-            print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
+            print(f"  {told}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Print a line for every tenth of the stage, or if the last line is some seconds old."""
@@ -217,11 +220,11 @@ class _BarProgress(Progress):
         self._task = self._bars.add_task(text, total=None)
 
     def report_iterate(self, entry: Iterate) -> None:
-        self._left.n_iterates += 1
+        told = self._left.iterate_text(entry)
         if self._task is not None:
-            self._bars.update(self._task, description=f"{_format_iterate(entry)} ({self._text})")
+            self._bars.update(self._task, description=f"{told} ({self._text})")
             if self._is_verbose:
-                self._bars.console.print(f"  {_format_iterate(entry)}", markup=False, highlight=False)
+                self._bars.console.print(f"  {told}", markup=False, highlight=False)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         if self._task is not None:

@@ -371,8 +371,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
             ("effort", "prescribed", "prescribed_efforts", "effort"),
         ):
             if key in group and (key in ("q", "command") or len(group.attrs[names])):
-                values = np.array(group[key])
-                told = [*map(str, group.attrs[names])]
+                values, told = np.array(group[key]), [*map(str, group.attrs[names])]
                 yield RosTopicTimeSeries(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
     for sensor in (entry for entry in group.values() if isinstance(entry, h5py.Group)):
         measured = np.array(sensor["measured"])

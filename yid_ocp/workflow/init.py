@@ -196,12 +196,17 @@ def _summary_lines(
     ]
     damping = _value(proposal.urdf_joint_damping)
     lines += [f"model.damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
-    for group, places in proposal.point_placements.items():
-        lines += [f"sensors.{group}: {sentence}" for sentence in _place_sentences(places)]
+    told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
+    lost = [f"warning: {text}" for text in told if "`init` leaves out" in text]
+    for group, own in proposal.point_placements.items() if proposal.has_object else ():
+        if "." not in group and own and not any(place.frame for place in own):
+            frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
+            lost.append(f"warning: `check` will stop, because no point of {group} has a frame. Set {frames} or {use}")
+    lines = [*lost, "`init` chose:", *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(f"`diagnose` leaves out effects whose signals are not recorded: {', '.join(kinds)}.")
+        lines.append(f"`diagnose` cannot test these effects, because no signal shows them: {', '.join(kinds)}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "

@@ -84,12 +84,11 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
 
 def _predicted(run: RunSettings, system: System, progress: Progress, seed: int | None) -> _Made:
     progress.begin_stage("building the model and its compiled step")
-    step = build_step(run, system)
-    recordings = read_recordings_of_role(run, count=1)
+    step, recordings = build_step(run, system), read_recordings_of_role(run, count=1)
     options = replace(make_problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
     problem = EstimationProblem(step, recordings, (), options)
     episode, theta = problem.episodes[0], problem.theta
-    progress.begin_stage(f"simulating {episode.grid.steps} steps")
+    progress.begin_stage(f"simulating '{episode.name}' in {episode.grid.steps} steps")
     outcome = problem.predictor.predict_episode(episode, theta, np.zeros(len(problem.initial_unknowns)), False)
     if isinstance(outcome, str):
         return outcome, []

@@ -219,8 +219,7 @@ def _segments(
     parent = cable.main_branch_vertex_names
     turns = flexible.edge_to_edge_rotations_from_vertices(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
-    carried = list(accumulate(turns, operator.matmul))
-    segments = []
+    carried, segments = list(accumulate(turns, operator.matmul)), []
     for name, chain in cable.vertex_names_by_branch.items():
         branch = options.branch_properties_by_name.get(name, options.default_branch)
         if name == cable.parent_segment:
