@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,7 @@ from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, va
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
-_MAX_CHANGES = 5  # number of named parameters, the largest changes first
-_MAX_EVENTS = 3  # number of named events; a table has all
+_MAX_NAMED = 5  # number of named parameters, the largest changes first, and of named events
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
@@ -85,7 +84,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
     check = "If you did not push the arm on purpose, look at the recordings at these times."
     left = f"The tests leave out {count_with_noun(len(told), 'brief disturbance')}: "
-    text += [_listed(left, told, f". {check}", max_entries=_MAX_EVENTS)]
+    text += [_listed(left, told, f". {check}", max_entries=_MAX_NAMED)]
     text += [*overspeed_truncation_messages(result), f"Next experiment: {result.next_experiment}"]
     return "\n".join(filter(None, text))
 
@@ -109,10 +108,6 @@ def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) 
     return f"{beginning}{text}{end}" if text else ""
 
 
-def _and(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
-
-
 def _short(number: float) -> str:
     return f"{number:.3g}" if number < 1000 else f"{number:.0f}"
 
@@ -127,9 +122,10 @@ def _use(result: DiagnosisResult) -> Iterator[str]:
     elif result.verdict == "effect":
         is_left = result.remaining_test.p_value < result.thresholds.significance_level
         beyond = ", but expect errors beyond noise" * is_left
-        yield f"Use the model with {_and([own.label for own in result.accepted_effects])}, not the nominal one{beyond}."
+        names = abbreviated_names_text([effect.label for effect in result.accepted_effects])
+        yield f"Use the model with {names}, not the nominal one{beyond}."
     if rivals:
-        causes = _and([f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals])
+        causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
         yield f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
 
 
@@ -190,7 +186,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     """Sentences on the selected effects, and on why the verdict is unknown."""
     added, total = result.selected_effects, result.closure_by_selected_effects
     limits, text, s = result.thresholds, list[str](), "s" if len(added) == 1 else ""
-    names = _and([entry.effect.label for entry in added])
+    names = abbreviated_names_text([entry.effect.label for entry in added])
     if added:
         part = "an unknown part of the error beyond noise on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
@@ -204,7 +200,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
-    unsure = _and([*(sizes := result.undetermined_sizes(limits))])
+    unsure = abbreviated_names_text([*(sizes := result.undetermined_sizes(limits))])
     size = f"the size of {unsure} is uncertain (less than {limits.min_z:g} ± from no effect, if ± includes the gap)"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
@@ -281,7 +277,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)]
+    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_NAMED)]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:

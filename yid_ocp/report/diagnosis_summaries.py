@@ -43,7 +43,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdict = result["verdict"].replace("_", " ")
     gap, *others = result["summary"].split("\n")
     is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
-    head = "Verdict" + " (in doubt until the issues above are corrected)" * is_severe
+    head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe
     parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:]
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
@@ -93,7 +93,6 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
-    yield "After the issues above are corrected, diagnose again." if is_severe else ""
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         known = result["next_plan"].items()
@@ -177,10 +176,10 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
-    experiments: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
+    tried: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged", 0)))
-        experiments.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
+        tried.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
     sure_of: TableRows = [("stated probability (mean of a fifth of the cases)", "true share: sets with the cause")]
     sure_of += [(f"{own['level']:.2f}", _rate(own)) for own in result["calibration"]["probabilities"]]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
@@ -192,8 +191,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         place = (", ".join(entry["confusable"]) or "-", "right" if entry["location_first"] else "-")
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
-    tables = {"Score": marks, "Detection by size": seen, "Experiments": experiments, "Probabilities": sure_of}
-    tables["Cases"] = cases
+    tables = {"Score": marks, "Detection by size": seen, "Experiments": tried, "Probabilities": sure_of, "Cases": cases}
     if (rescored := result.get("rescored")) is not None:
         head = ("case", "truth", "then", "now")
         differ: TableRows = [head, *(tuple(own[key] for key in head) for own in rescored["changed"])]
@@ -234,6 +232,11 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for name, own in entry["parameters"].items():
             if own["value"] is not None:
                 found.setdefault(name, []).append(own)
+    ended = Counter(entry["status"].replace("_", " ") for entry in runs).items()
+    said = [f"{len(runs)} run{'s' * (len(runs) != 1)}: {', '.join(f'{count} {status}' for status, count in ended)}."]
+    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
+    said += [] if (alike := result["history"]) is None else _history_sentences(alike)
+    yield from (SummaryStatement(text, "verdict") for text in said)
     names = sorted(found, key=lambda name: -len(found[name]))
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
@@ -250,16 +253,8 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
-    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
-    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
-    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
-    if (alike := result["history"]) is not None:
+    if alike is not None:
         yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
-        drifted, wrong = _drifted_and_distrusted(alike)
-        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
-        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
-    yield from (SummaryStatement(text, "verdict") for text in said)
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
@@ -363,6 +358,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 
 @register_summary("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
@@ -373,7 +369,6 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield SummaryTable([*_consistency_rows(result)], "Runs")
-    yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -383,13 +378,9 @@ def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
 
 
-def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    drifted = [name for name, entry in history["parameters"].items() if entry["drifted"]]
-    return drifted, [entry["name"] for entry in history["runs"] if entry["distrusted"]]
-
-
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
+    runs, drifted = result["runs"], [name for name, entry in result["parameters"].items() if entry["drifted"]]
+    wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     p = p_value_text(result["p_value"], "= ")
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."

@@ -44,7 +44,6 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
 _MAX_DIRECTIONS = 8
-_UNSEEN = " is observed by no sensor"  # end of the words on such a direction
 _MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 _MAX_INITIAL_MISFIT = 30.0  # rms error at initial values, in stds of noise, up to which `check` shows finer models
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
@@ -234,10 +233,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
-    unseen = [name for name in parameters if f"{name}{_UNSEEN}" in hidden]
+    unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}, so the table has no value (–) and no ±." if unseen else ""
-    alone = tuple(f"{name} is determined only weakly" for name in parameters)  # as the table says
-    hidden = [w for w in hidden if not w.endswith(_UNSEEN) and not w.startswith(alone)]
+    hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
     lost = [name for name, entry in parameters.items() if entry["verdict"] in ("weak", "not_identifiable")]
     if lost:

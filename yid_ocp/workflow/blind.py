@@ -357,11 +357,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
     "finer_integration": _ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
     "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", has_torque_noise=True, is_without_object=True),
     "bare_arm_efforts": _ExperimentVariation(
-        0.1,
-        "the arms alone, moved as measured",
-        has_torque_noise=True,
-        is_without_object=True,
-        has_prescribed_arms=True,
+        0.1, "the arms, moved as measured", has_torque_noise=True, is_without_object=True, has_prescribed_arms=True
     ),
 }
 """Variations by name. An experiment has the name `CONFIGURATION.VARIATION`."""
