@@ -253,7 +253,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
     assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
     told = sorted(text.removeprefix("held-out chi2/n with ") for done, _, text in heard.parts if done)
-    best = "1.234 (best: 1.234)"
+    best = "1.234 (best so far: 1.234)"
     assert told == [f"friction@elbow: {best}", f"offset@elbow: {best}", "third@x: failed"]
     assert refit_with_each_effect(search, (), [((lost,), {})], {}) == [], "it predicts no held-out recording"
     assert asked[3][0] is TWO_RECORDINGS, "a step for one refit costs more than it saves"

@@ -151,16 +151,18 @@ def _explanations(
     truth: Mapping[str, float],
     has_process_noise: bool,
 ) -> list[str]:
-    runs, sentences, lost = [run for run in runs if run.has_values], [], []
+    runs, sentences, weak, lost = [run for run in runs if run.has_values], [], [], []
     for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
         known = f"{name} (truth {truth[name]:g} {reference.unit})" if name in truth else name
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
         use = f"Do not rely on one method's value in {reference.unit}: {places}"
-        use = "Use its 95 % interval by `solve`" if has_process_noise and reference.verdict == "weak" else use
         if reference.verdict == "not_identifiable":
             lost.append(known)
+        elif has_process_noise and reference.verdict == "weak":
+            weak.append(known)
         else:
             sentences.append(f"{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}. {use}")
+    sentences += [f"For {', '.join(weak)}, use the 95 % interval of the column `solve`"] if weak else []
     sentences += [f"{', '.join(lost)} cannot be found, so no value is shown (–)"] if lost else []
     descents = [run for run in runs if run.method == "steepest_descent" and truth and not has_process_noise]
     return sentences + [_descent_errors(run, best, judged, truth) for run in descents]

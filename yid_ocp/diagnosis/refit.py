@@ -424,7 +424,7 @@ def refit_with_each_effect(
     def one(entry: EffectsWithStart) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
-        left = "failed" if fit is None else f"{fit.held_out_loss.chi2_per_sample:.4g} (best: {table()[1][1]})"
+        left = "failed" if fit is None else f"{fit.held_out_loss.chi2_per_sample:.4g} (best so far: {table()[1][1]})"
         parts.count_done(f"held-out chi2/n with {label}: {left}", table)
         return fit
 

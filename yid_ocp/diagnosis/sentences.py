@@ -264,8 +264,8 @@ def _remains(result: DiagnosisResult) -> list[str]:
     sizes = ((x, name, unit) if unit != "m" else (1e6 * x, name, "mm") for x, name, unit in beyond)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in sizes}
     mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
-    effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
-    who = f"the {f'model with {effects}' if effects else 'nominal model'}"
+    effects = result.accepted_effects
+    who = "the model with the effects" if effects else "the nominal model"
     now = f". Its chi2 per degree of freedom there is {_short(result.remaining_test.chi2_per_dof)}" * bool(effects)
     said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}{now}."
     if result.remaining_test.p_value < result.thresholds.significance_level:

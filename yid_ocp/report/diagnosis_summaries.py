@@ -71,8 +71,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     if any(entry["closure"] is not None for entry in result["which"]):
-        yield "Closure: part of the held-out error beyond noise that a candidate alone removes (–: not refitted)."
-    yield "Values without ± are forecasts. p: probability that noise alone gives such a score."
+        yield "Closure: part of the held-out error beyond noise that a candidate alone removes (–: not refitted alone)."
+    yield "Values without ± are forecasts of a linear model. p: probability that noise alone gives such a score."
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""

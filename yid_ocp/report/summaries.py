@@ -234,13 +234,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
-    yield f"No sensor observes {', '.join(unseen)}, so the table has no value (–) and no ±." if unseen else ""
+    yield f"No sensor observes {', '.join(unseen)}, so the recordings do not inform the value." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
     lost = [name for name, entry in parameters.items() if entry["verdict"] in ("weak", "not_identifiable")]
     if lost:
         name = f"parameters.{(unseen or lost)[0]}"
-        yield "To find more parameters, record other motions (`yid-ocp plan`). To fix one whose value is known, add"
+        yield "A parameter that cannot be found has no value (–). To find more, record other motions (`yid-ocp plan`)."
+        yield "To fix a parameter whose value is known, add"
         yield CodeBlock(f"--set {name}.free=false --set {name}.initial=VALUE")
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."

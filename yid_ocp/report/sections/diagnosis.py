@@ -118,8 +118,8 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
         "change over time, are added to the model, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
-        f"{evidence['plant']:.4g} with mechanics alone, by {evidence['sensor']:.4g} with sensors alone, and by "
-        f"{evidence['both']:.4g} with both. An alternative that is lower by 5 has odds of 1 to 150.",
+        f"{evidence['plant']:.0f} with mechanics alone, by {evidence['sensor']:.0f} with sensors alone, and by "
+        f"{evidence['both']:.0f} with both. An alternative that is lower by 5 has odds of 1 to 150.",
     ]
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
