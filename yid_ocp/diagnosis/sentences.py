@@ -194,7 +194,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
             part = f"{100 * total.fraction:.3g} % of the error beyond noise on held-out motions ({interval})"
-        text += [f"{names} remove{s} {part}:", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
+        text += [f"{names} remove{s} {part}.", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
     rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
     text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)

@@ -232,11 +232,6 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for name, own in entry["parameters"].items():
             if own["value"] is not None:
                 found.setdefault(name, []).append(own)
-    ended = Counter(entry["status"].replace("_", " ") for entry in runs).items()
-    said = [f"{len(runs)} run{'s' * (len(runs) != 1)}: {', '.join(f'{count} {status}' for status, count in ended)}."]
-    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
-    said += [] if (alike := result["history"]) is None else _history_sentences(alike)
-    yield from (SummaryStatement(text, "verdict") for text in said)
     names = sorted(found, key=lambda name: -len(found[name]))
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
@@ -253,8 +248,16 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
-    if alike is not None:
+    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
+    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
+    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
+    if (alike := result["history"]) is not None:
         yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
+        drifted, wrong = _drifted_and_distrusted(alike)
+        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
+        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
+        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
+    yield from (SummaryStatement(text, "verdict") for text in said)
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
@@ -346,19 +349,14 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
         cells = (value_text_and_display_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
         shown = f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""
         yield f"held-out rms error of {channel}{shown}", *cells
-    for words, key, form in (
-        ("iterations", "iterations", "d"),
-        ("evaluations", "evaluations", "d"),
-        ("wall time [s]", "wall_seconds", ".2f"),
-        ("CPU time [s]", "cpu_seconds", ".2f"),
-        ("peak memory [MiB]", "peak_memory_mib", ".0f"),
-    ):
-        yield words, *(f"{entry[key]:{form}}" for entry in entries)
+    yield from ((key, *(str(entry[key]) for entry in entries)) for key in ("iterations", "evaluations"))
+    for words, key in (("wall time [s]", "wall_seconds"), ("CPU time [s]", "cpu_seconds")):
+        yield words, *(f"{entry[key]:.2f}" for entry in entries)
+    yield "peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)
 
 
 @register_summary("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
@@ -369,6 +367,7 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield SummaryTable([*_consistency_rows(result)], "Runs")
+    yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -378,9 +377,13 @@ def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
 
 
+def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    drifted = [name for name, entry in history["parameters"].items() if entry["drifted"]]
+    return drifted, [entry["name"] for entry in history["runs"] if entry["distrusted"]]
+
+
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    runs, drifted = result["runs"], [name for name, entry in result["parameters"].items() if entry["drifted"]]
-    wrong = [entry["name"] for entry in runs if entry["distrusted"]]
+    runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
     p = p_value_text(result["p_value"], "= ")
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."

@@ -453,11 +453,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     begun = f" (of one reading: the largest within {seconds:.2g} s of equilibrium)" if seconds else ""
-    yield (
-        "The table states which equations of one time step contain a parameter (del: motion of a coordinate, p1: its "
-        "momentum after the step), and which of them change a reading (observed). Its last columns have the change of "
-        f"readings by one unit of the parameter, in standard deviations of noise (std){begun}."
+    text = (
+        "The table has the equations of one time step that contain a parameter (del: motion of a coordinate, p1: its "
     )
+    text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
+    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std){begun}."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""

@@ -226,7 +226,7 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
             result += [] if block.is_page_only else [*space, *aligned_table_lines(block.rows), ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
-        elif block.text.endswith((".", ":")):
+        elif block.text.endswith("."):
             result += textwrap.wrap(block.text, _PROSE_WIDTH)
         elif len(block.text) > _MAX_UNWRAPPED_NOTE:
             result += textwrap.wrap(block.text, _NOTE_WIDTH, subsequent_indent="  ")
