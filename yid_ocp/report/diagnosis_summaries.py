@@ -50,8 +50,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     added = (f"+ {step['added']}" for step in steps)
     rows: TableRows = [("held-out error (rms)", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
     for channel, error in before["rmse"].items():
-        errors = [error, *(step["rmse"].get(channel) for step in steps)]
-        errors += [noise.get(channel)] if noise else []
+        errors = [error, *(step["rmse"].get(channel) for step in steps), *([noise.get(channel)] if noise else [])]
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     yield SummaryTable(rows, "Errors on held-out recordings", is_key_table=True)

@@ -241,8 +241,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if lost:
         name = f"parameters.{(unseen or lost)[0]}"
         yield "A parameter that cannot be found has no value (–). To find more, record other motions (`yid-ocp plan`)."
-        yield "To fix a parameter whose value is known, add"
-        yield CodeBlock(f"--set {name}.free=false --set {name}.initial=VALUE")
+        yield f"To fix a parameter whose value is known, add --set {name}.free=false --set {name}.initial=VALUE."
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if is_initial:
@@ -453,9 +452,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     begun = f" (of one reading: the largest within {seconds:.2g} s of equilibrium)" if seconds else ""
-    text = (
-        "The table has the equations of one time step that contain a parameter (del: motion of a coordinate, p1: its "
-    )
+    text = "The table has the equations of a time step that contain a parameter (del: motion of a coordinate, p1: its "
     text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
     yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std){begun}."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)

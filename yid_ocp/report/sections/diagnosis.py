@@ -115,8 +115,8 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         f"Nothing is wrong at {noticed}: a gap would have been detected there." if noticed else "",
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
         f"What the effects leave is mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
-        "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors) are added, as "
-        "few as explain the residual. They may change over time, and explain "
+        "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
+        "change over time, are added, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
         f"{evidence['plant']:.0f} with mechanics, {evidence['sensor']:.0f} with sensors, {evidence['both']:.0f} with "
         "both. An alternative that is lower by 5 has odds of 1 to 150.",
