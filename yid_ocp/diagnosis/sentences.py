@@ -160,12 +160,12 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
-    small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
+    small = "The error is significantly larger than noise, but too small to count as a gap. "
     seen = f"The error has the pattern of {''.join(best)} (p {p_value_text(along, '= ')} if there is only noise)"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    return [small * is_significant, narrow * (along < level), unseen_effects_sentence(unseen)]
+    return [f"{small * is_significant}A gap needs {needs}.", narrow * (along < level), unseen_effects_sentence(unseen)]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:

@@ -234,7 +234,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
-    yield f"No sensor observes {', '.join(unseen)}, so the recordings do not inform the value." if unseen else ""
+    yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
     lost = [name for name, entry in parameters.items() if entry["verdict"] in ("weak", "not_identifiable")]
@@ -451,10 +451,10 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    begun = f" (of one reading: the largest within {seconds:.2g} s of equilibrium)" if seconds else ""
+    begun = f" Of one reading, it is the largest within {seconds:.2g} s of equilibrium." if seconds else ""
     text = "The table has the equations of a time step that contain a parameter (del: motion of a coordinate, p1: its "
     text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
-    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std){begun}."
+    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std).{begun}"
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""
