@@ -123,7 +123,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"The first answer is the true cause in {right['count']} of {right['of']} cases with a gap."] * bool(right["of"])
+    said = [f"The first answer is true in {right['count']} of {right['of']} cases with a gap."] * bool(right["of"])
     if alarms["of"]:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
     if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
