@@ -218,7 +218,7 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     assert found.disagreements == {"one": [], "two": [said]}
     weak, lost = found.explanations
     assert all(fact in weak for fact in ("c (truth 11.25 N m/rad)", "weakly", "N m/rad: 5 (one), 99 (two)")), weak
-    assert lost.startswith("d cannot be found; ")
+    assert lost.startswith("d cannot be found, ")
 
 
 @pytest.mark.parametrize(
@@ -275,8 +275,7 @@ def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     assert {run.solution.parameters["a"].verdict for run in found.method_results} == {"not_trusted"}
     # found by the likelihood, so the methods have to agree on it
     assert all(p in found.disagreements["single_shooting"][0] for p in ("values than steepest_descent, b", ": a = 7.5"))
-    told = "gives a = 7 N m/rad (true 10), although the recordings determine this. Unlike `yid-ocp solve`, the methods"
-    assert told in found.explanations[-1]
+    assert found.explanations == ()  # the command says it for all methods together
 
 
 def test_a_method_is_stopped_after_its_share_of_the_budget(repository):

@@ -181,7 +181,7 @@ def test_changes_are_ranked_and_the_smallest_set_is_a_pair(tube_ranking):
     # the tube is turned only by a weld, and what that takes is felt only in torques
     assert [set(entry.changes) for entry in ranking.smallest_sufficient_sets] == [{"weld", "torque"}]
     assert ranking.smallest_sufficient_sets[0].identifiable == 2
-    assert "simulating with weld grasps in place of points" in stages
+    assert "simulating with weld grasps in place of point grasps" in stages
 
 
 def test_springs_need_a_marker_off_the_axis_or_the_joint(springs):

@@ -261,7 +261,7 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
     assert list(told) == ["recording", "location", "channel", "kind", "from", "to", "impulse", "peak", "unit", "std"]
     assert (told["location"], told["recording"]) == ("elbow", "run_1")
     assert told["impulse"] == pytest.approx(0.1, rel=0.15)
-    assert "The tests leave out these brief disturbances: push of elbow at 1.50 to" in finding.summary
+    assert "The tests leave out 1 brief disturbance: push of elbow at 1.50 to" in finding.summary
 
 
 @pytest.mark.usefixtures("without_law")

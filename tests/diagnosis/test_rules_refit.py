@@ -244,8 +244,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     tried = [((FRICTION,), {A: 0.7}), ((other,), {"k": 3.0}), ((third,), {})]
     found = refit_with_each_effect(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
-    by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
-    name = "base@x and friction@elbow"
+    by_kind, name = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}, "base@x and friction@elbow"
     # one step for all, without other candidates
     group = ["base@x", "friction@elbow", "offset@elbow", "third@x"]
     assert by_kind["friction"] == (group, ["base", "friction"], {"k": 2.0, A: 0.7}, "store", name, LIMITS)
@@ -253,8 +252,9 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert [("base@x" in stage, "3 effects" in stage) for stage in heard.stages] == [(True, True)]
     both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
     assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
-    told = sorted((text.split()[3], text.split()[-1]) for done, _, text in heard.parts if done)
-    assert told == [("friction@elbow", "1.234"), ("offset@elbow", "1.234"), ("third@x", "failed")]
+    told = sorted(text.removeprefix("held-out chi2/n with ") for done, _, text in heard.parts if done)
+    best = "1.234 (best so far: 1.234)"
+    assert told == [f"friction@elbow: {best}", f"offset@elbow: {best}", "third@x: failed"]
     assert refit_with_each_effect(search, (), [((lost,), {})], {}) == [], "it predicts no held-out recording"
     assert asked[3][0] is TWO_RECORDINGS, "a step for one refit costs more than it saves"
     # from elsewhere they have names of their own in the store

@@ -46,7 +46,7 @@ def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
         noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
     )
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
-    sizes = f"0 N m at joints.effort.elbow, {size:.2g} m at points.end (rms, noise subtracted)."
+    sizes = f"0 N m at joints.effort.elbow, {1e3 * size:.2g} mm at points.end (rms, noise subtracted)."
     assert f"error of the nominal model is {sizes}" in diagnosis_summary_text(made)  # noise alone gives the torque's
 
 

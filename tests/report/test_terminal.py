@@ -185,8 +185,8 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "All methods agree within their uncertainty on the parameters that are found."
-    assert said in told("yid-compare/1", compared())
+    said = "Use the column `solve`: all methods agree within their ± on the parameters that are found."
+    assert told("yid-compare/1", compared())[0] == said
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
@@ -198,9 +198,9 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     assert lines[0].startswith("Do not use the columns single_shooting, late, because these methods ignore noise")
     assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting (more than 2 std away)." in lines
     assert "The time limit ended late before the first iteration, so there are no values." in lines
-    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "verdict"]
-    assert "a          7                stopped  9 ± 0.1  found" in lines
-    assert not any("does not explain" in line or "All methods agree" in line for line in lines)
+    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "unit", "verdict"]
+    assert "a          7                stopped  9 ± 0.1  N m/rad  found" in lines
+    assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
@@ -209,7 +209,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
     assert "No set of up to three changes makes it possible to find all parameters." in lines
-    assert "None of 1 parameters can be found" in lines[-1]
+    assert "None of 1 parameters can be found" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     assert "The fewest changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)
 

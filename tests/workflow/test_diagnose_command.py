@@ -64,7 +64,7 @@ class Interrupting(Progress):
         self.left = after
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        self.left -= text.startswith("the refit with")
+        self.left -= text.startswith("held-out chi2/n with")
         if self.left <= 0:
             raise KeyboardInterrupt
 

@@ -95,7 +95,7 @@ def compare_methods(
             if callback is not None:
                 callback(name, entry)
             if time.perf_counter() - begun > share:
-                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget (raise this)")
+                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget (raise it)")
 
         return told
 
@@ -121,7 +121,7 @@ def compare_methods(
     else:
         judged = estimation.add_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
-    explained = tuple(_explanations(runs, best, judged.parameters, truth or {}))
+    explained = tuple(_explanations(runs, best, judged.parameters, truth or {}, whole.has_process_noise))
     return MethodsComparisonResult(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
 
 
@@ -149,16 +149,22 @@ def _explanations(
     best: _MethodResult,
     judged: Mapping[str, ParameterEstimate],
     truth: Mapping[str, float],
+    has_process_noise: bool,
 ) -> list[str]:
-    runs, sentences = [run for run in runs if run.has_values], []
+    runs, sentences, weak, lost = [run for run in runs if run.has_values], [], [], []
     for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
-        known = f" (truth {truth[name]:g} {reference.unit})" if name in truth else ""
+        known = f"{name} (truth {truth[name]:g} {reference.unit})" if name in truth else name
         places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
-        is_lost = reference.verdict == "not_identifiable"
-        ends = "; no value is shown, because the data do not determine it"
-        ends = ends if is_lost else f". Do not rely on one method's value in {reference.unit}: {places}"
-        sentences.append(f"{name}{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}{ends}")
-    descents = [run for run in runs if run.method == "steepest_descent" and truth]
+        use = f"Do not rely on one method's value in {reference.unit}: {places}"
+        if reference.verdict == "not_identifiable":
+            lost.append(known)
+        elif has_process_noise and reference.verdict == "weak":
+            weak.append(known)
+        else:
+            sentences.append(f"{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}. {use}")
+    sentences += [f"For {', '.join(weak)}, use the 95 % interval of the column `solve`"] if weak else []
+    sentences += [f"{', '.join(lost)} cannot be found, so no value is shown (–)"] if lost else []
+    descents = [run for run in runs if run.method == "steepest_descent" and truth and not has_process_noise]
     return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
 
 
@@ -185,7 +191,7 @@ def _descent_errors(
     if run.solution.status != Status.CONVERGED:
         why = f"It ended too early ({run.solution.status.value})"
     elif all(is_far(best, name) for name in seen):
-        why = "Unlike `yid-ocp solve`, the methods here ignore noise of the torques or angles that move the model"
+        why = f"The best fit, that of {best.method}, is also far from the truth"
     return f"Do not use {run.method} here: it gives {places}, although the recordings determine this. {why}"
 
 

@@ -214,11 +214,11 @@ class VariantPositionSensitivities:
 
 
 SETUP_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
-    "weld": "weld grasps in place of points",
+    "weld": "weld grasps in place of point grasps",
     "second_arm": "a second arm",
     "motion": "another motion",
     "travel": "another motion of twice the travel",
-    "torque": "joint torques as a measurement, the arms' motion as known",
+    "torque": "joint torques as measurements, with the arms moved as measured",
 }
 
 

@@ -66,6 +66,7 @@ def cross_validate_law_by_motion_kind(
     errors: dict[str, float] = {}
     used = (e.measurements for e in problem.episodes)
     is_whitened = {own[i].sensor.unit for own in used for i in _indices_of_sensors_of_friction(own)} != {"rad"}
+    unit = "std" if is_whitened else "rad"
     pairs = list(zip(problem.episodes, problem.whitening_filters, strict=True))
     known = problem.unknowns.named_values(solution.x)
     for kind, own in kinds.items():
@@ -87,8 +88,8 @@ def cross_validate_law_by_motion_kind(
                 rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
         if parts is not None:
-            parts.count_done(f"{law} without {kind}")
-    unit = "std" if is_whitened else "rad"
+            error = np.mean([errors[name] for name in own if name in errors])
+            parts.count_done(f"{law} predicts {kind}, not fitted, with an error of {error:.3g} {unit}")
     return CrossValidatedFrictionLawFit(law, errors, unit, solution.status.value == "converged")
 
 

@@ -114,7 +114,7 @@ def solution_with_profile_intervals(
         return entry
 
     # each parameter takes about one and a half times as long as the solution
-    progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood", 7.5 * len(asked), 5.2)
+    progress.begin_stage(f"computing 95 % intervals of {', '.join(asked)}", 7.5 * len(asked), 5.2)
     found = apply_function_per_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 

@@ -220,9 +220,10 @@ class _Outcomes:
     def _judged(self, sets: Sequence[Sequence[ExperimentChange]], _: float) -> list[ChangedExperimentResult]:
         self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'changed experiment')}")
         found = []
-        for done, changes in enumerate(sets):
-            self.progress.report_parts_done(done, len(sets), _words(changes))
-            found.append(self._outcome(changes))
+        for done, changes in enumerate(sets, 1):
+            found.append(own := self._outcome(changes))
+            text = f"{own.identifiable} of {len(own.verdicts)} parameters found" if own.verdicts else "no result"
+            self.progress.report_parts_done(done, len(sets), f"{text} with {own.description}")
         return found
 
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:

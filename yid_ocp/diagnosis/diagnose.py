@@ -255,7 +255,7 @@ def _with_changed_parameters(
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
-    search.progress.begin_stage("trying half the time step", 1.0, 12.0)
+    search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
     fine = _at_finer_step(search, fit, events)
     left = discretisation.predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
     if left is None:
@@ -285,7 +285,7 @@ def _with_errors_of_step_and_encoders(
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
     search = seen.with_events
-    search.progress.begin_stage("trying twice the links", 1.0, 11.0)
+    search.progress.begin_stage("testing whether twice the links lower chi2", 1.0, 11.0)
     own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
     known = search.problem.problem, own, fit.unknowns, fit.evaluation
     corrected = discretisation.problem_data_corrected_for_few_links(*known, fit.effects, least)

@@ -95,12 +95,13 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
+        noise = {} if self.nominal_model.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",
             **judged,
-            "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names},
+            "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names, "noise": noise},
             "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
             "rejected_candidates": [

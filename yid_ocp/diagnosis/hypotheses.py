@@ -309,7 +309,7 @@ def make_all_candidates_problem(
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     _exclude_candidates(effects, leave_out)  # reject names before compilation
-    progress.begin_stage(f"building one model with all candidate effects ({len(effects)})", ahead=19.5)
+    progress.begin_stage(f"building one model with all {len(effects)} candidate effects", ahead=19.5)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
     return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
 

@@ -224,7 +224,7 @@ class RefitContext:
         """The effects of a fit, refitted with estimation and held-out recordings exchanged."""
         if self.problem.is_split_in_blocks:
             return None
-        self.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 5.5)
+        self.progress.begin_stage("fitting the same effects to the held-out recordings", 1.0, 5.5)
         composed = self._problem_of_round(fit.effects)
         problem = composed.problem
         exchanged = problem.with_episodes(problem.held_out, problem.episodes)
@@ -424,8 +424,8 @@ def refit_with_each_effect(
     def one(entry: EffectsWithStart) -> RefitStatistics | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
-        left = "failed" if fit is None else f"gives held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
-        parts.count_done(f"the refit with {label} {left}", table)
+        left = "failed" if fit is None else f"{fit.held_out_loss.chi2_per_sample:.4g} (best so far: {table()[1][1]})"
+        parts.count_done(f"held-out chi2/n with {label}: {left}", table)
         return fit
 
     together = {effect.label: effect for effects, _ in tried for effect in (*base, *effects)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text, count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import select_largest_gap_locations
@@ -21,7 +21,7 @@ from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, va
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
-_MAX_CHANGES = 5  # number of named parameters, the largest changes first
+_MAX_NAMED = 5  # number of named parameters, the largest changes first, and of named events
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
@@ -48,7 +48,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         if told := [text for several, text in advice if len(several) > 1]:
             return f"{told[0]} This can separate these effects: {', '.join([effect.label for effect in rivals])}."
     place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
-    mostly = _listed("Record slow and fast motions, with pauses, in which ", place, " (where the gap is) moves most.")
+    mostly = _listed("Record slow and fast motions, with pauses, and most motion at ", place, " (where the gap is).")
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
         "unknown": mostly or "Record faster and larger motions of all joints, which show more effects.",
@@ -63,7 +63,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
     stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.0f} s. Not tested: "
-    text = [_gap(result), _listed(stopped, result.untried, ". To test them, raise diagnosis.budget.")]
+    untried = _listed(stopped, result.untried, ". To test them, raise diagnosis.budget.")
+    text = [" ".join([*_use(result), _gap(result)]), untried]
     if result.verdict not in ("insufficient_data", "no_gap"):
         (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
         text += [*found, error, change] if result.accepted_effects else [error, *found, change]
@@ -82,7 +83,8 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
     told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
     check = "If you did not push the arm on purpose, look at the recordings at these times."
-    text += [_listed("The tests leave out these brief disturbances: ", told, f". {check}")]
+    left = f"The tests leave out {count_with_noun(len(told), 'brief disturbance')}: "
+    text += [_listed(left, told, f". {check}", max_entries=_MAX_NAMED)]
     text += [*overspeed_truncation_messages(result), f"Next experiment: {result.next_experiment}"]
     return "\n".join(filter(None, text))
 
@@ -106,24 +108,46 @@ def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) 
     return f"{beginning}{text}{end}" if text else ""
 
 
+def _short(number: float) -> str:
+    return f"{number:.3g}" if number < 1000 else f"{number:.0f}"
+
+
+def _use(result: DiagnosisResult) -> Iterator[str]:
+    """Yield sentences on whether a model with a gap may be used, and on the most probable cause."""
+    rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
+    if result.verdict == "unknown":
+        yield "Do not use the estimates, because the cause of the model's error is unknown."
+    elif result.verdict == "confusable":
+        yield "Do not use the estimates yet, because several causes explain the model's error about equally well."
+    elif result.verdict == "effect":
+        is_left = result.remaining_test.p_value < result.thresholds.significance_level
+        beyond = ", but expect errors beyond noise" * is_left
+        names = abbreviated_names_text([effect.label for effect in result.accepted_effects])
+        yield f"Use the model with {names}, not the nominal one{beyond}."
+    if rivals:
+        causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
+        yield f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
+
+
 def _gap(result: DiagnosisResult) -> str:
     """Sentence on whether there is a gap."""
     tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
-    fitted, other = (f"{test.chi2_per_dof:.3g}" for test in tests)
+    fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
     p_value = min(test.p_value for test in tests)
     unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    p_text, detectable = p_value_text(p_value, "= "), f"would show {sum(seen)} of {len(seen)} effects"
+    chance = f"p {p_value_text(p_value, '= ')}: the probability that noise alone gives such an error"
     if result.verdict == "insufficient_data":
         dof, few = f"{tests[0].degrees_of_freedom:.0f}", f"more than {unknowns}, the number of unknowns, are needed"
-        said = f"they have {dof} independent samples ({few}), and {detectable} (at least 1 is needed)"
-        return f"The recordings are insufficient for a diagnosis: {said}."
+        said = f"{dof} independent samples ({few}), and would show {sum(seen)} of {len(seen)} effects"
+        return f"The model is not tested: the recordings have {said} (at least 1 is needed)."
     if result.verdict == "no_gap":
-        return "\n".join(filter(None, [f"There is no relevant gap: {sizes} (p {p_text}).", *_why_no_gap(result)]))
+        said = f"Use the model for motions like these. There is no relevant gap: {sizes} ({chance})."
+        return "\n".join(filter(None, [said, *_why_no_gap(result)]))
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
         only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
-        return f"The nominal model has an error beyond noise (a gap){only}: {sizes} (p {p_text})."
+        return f"The nominal model has an error beyond noise (a gap){only}: {sizes} ({chance})."
     best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
     small = f"But the error has the pattern of the effect {best.effect.label} (p {p_value_text(p_value, '= ')})"
     return f"In total the error of the nominal model is within noise: {sizes}. {small}."
@@ -136,12 +160,12 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
     along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
     needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
-    small = f"The error is significantly larger than noise, but too small to count as a gap. A gap needs {needs}."
+    small = "The error is significantly larger than noise, but too small to count as a gap. "
     seen = f"The error has the pattern of {''.join(best)} (p {p_value_text(along, '= ')} if there is only noise)"
     is_significant = min(test.p_value for test in tests) < limits.significance_level
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    return [small * is_significant, narrow * (along < level), unseen_effects_sentence(unseen)]
+    return [f"{small * is_significant}A gap needs {needs}.", narrow * (along < level), unseen_effects_sentence(unseen)]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
@@ -162,7 +186,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     """Sentences on the selected effects, and on why the verdict is unknown."""
     added, total = result.selected_effects, result.closure_by_selected_effects
     limits, text, s = result.thresholds, list[str](), "s" if len(added) == 1 else ""
-    names = " and ".join(entry.effect.label for entry in added)
+    names = abbreviated_names_text([entry.effect.label for entry in added])
     if added:
         part = "an unknown part of the error beyond noise on held-out motions"
         if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
@@ -170,21 +194,19 @@ def _causes(result: DiagnosisResult) -> list[str]:
         if math.isfinite(total.ci_low):
             interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
             part = f"{100 * total.fraction:.3g} % of the error beyond noise on held-out motions ({interval})"
-        text += [f"{names} remove{s} {part}:", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
+        text += [f"{names} remove{s} {part}.", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
     rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
     text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
-    causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
-    unsure = " and ".join(sizes := result.undetermined_sizes(limits))
-    size = f"the size of {unsure} is uncertain: no value is {limits.min_z:g} std or more from that without effect"
+    unsure = abbreviated_names_text([*(sizes := result.undetermined_sizes(limits))])
+    size = f"the size of {unsure} is uncertain (less than {limits.min_z:g} ± from no effect, if ± includes the gap)"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
     more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set."
     reasons = {
-        "": f"With {100 * result.probability:.0f} % probability, the true cause is {causes}.",
         "none": f"{none} no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}",
         "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
         "stand_in": f"{none} {size}{apart}. {either}.",
@@ -192,7 +214,7 @@ def _causes(result: DiagnosisResult) -> list[str]:
     laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
     alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
     alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    return [*text, reasons[result.unknown_reason], alone * bool(laws), _several_places(result)]
+    return [*text, reasons.get(result.unknown_reason, ""), alone * bool(laws), _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:
@@ -239,21 +261,23 @@ def _remains(result: DiagnosisResult) -> list[str]:
     noise = {own.channel: own.noise_rmse for own in result.noise_floor}
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
-    worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in beyond}
+    sizes = ((x, name, unit) if unit != "m" else (1e6 * x, name, "mm") for x, name, unit in beyond)
+    worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in sizes}
     mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
-    effects = abbreviated_names_text([effect.label for effect in result.accepted_effects])
-    who = f"the {f'model with {effects}' if effects else 'nominal model'}"
-    said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}."
+    effects = result.accepted_effects
+    who = "the model with the effects" if effects else "the nominal model"
+    now = f". Its chi2 per degree of freedom there is {_short(result.remaining_test.chi2_per_dof)}" * bool(effects)
+    said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}{now}."
     if result.remaining_test.p_value < result.thresholds.significance_level:
         size = f"{', '.join(worst.values())} (rms, noise subtracted)"
-        said = f"On held-out motions, the error of {who} is {size}{mostly}."
+        said = f"On held-out motions, the error of {who} is {size}{now}{mostly}."
     changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
     moved = [
         f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
         for name, own in changes
         if _relative_change(own) > _MIN_RELATIVE_CHANGE
     ]
-    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_CHANGES)]
+    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_NAMED)]
 
 
 def _relative_change(own: Mapping[str, Any]) -> float:

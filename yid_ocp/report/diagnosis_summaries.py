@@ -42,12 +42,15 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
     gap, *others = result["summary"].split("\n")
-    parts = f"Verdict: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:]
+    is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
+    head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe
+    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:]
     yield from (SummaryStatement(part, "verdict") for part in parts)
-    before, steps = result["gap"]["before"], result.get("steps", ())
-    rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
+    added = (f"+ {step['added']}" for step in steps)
+    rows: TableRows = [("held-out error (rms)", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
     for channel, error in before["rmse"].items():
-        errors = [error, *(step["rmse"].get(channel) for step in steps)]
+        errors = [error, *(step["rmse"].get(channel) for step in steps), *([noise.get(channel)] if noise else [])]
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     yield SummaryTable(rows, "Errors on held-out recordings", is_key_table=True)
@@ -67,15 +70,15 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     if any(entry["closure"] is not None for entry in result["which"]):
-        yield "Refitted candidates come first. Closure: part of the held-out error beyond noise that one alone removes."
-    yield "Score: significance of a candidate before a refit. p: probability that noise alone gives such a score."
+        yield "Closure: part of the held-out error beyond noise that a candidate alone removes (–: not refitted alone)."
+    yield "Values without ± are forecasts of a linear model. p: probability that noise alone gives such a score."
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
     rows = [("effect", "places"), *((k, ", ".join(own)) for k, own in locations_by_effect_kind(unseen).items())]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
-    for signals, kinds in result.get("not_candidates", {}).items():
-        yield f"These effects were not tried, because no recording has the signal {signals}: {', '.join(kinds)}."
+    lacking = [f"{signals} ({', '.join(kinds)})" for signals, kinds in result.get("not_candidates", {}).items()]
+    yield f"No recording has these signals, so their effects were not tried: {', '.join(lacking)}." if lacking else ""
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
@@ -89,8 +92,6 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
-    if any(own["severity"] != "warning" for own in result.get("issues", ())):
-        yield "Issues of the recordings may have caused this verdict. Correct the issues, then diagnose again."
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         known = result["next_plan"].items()
@@ -104,6 +105,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     yield "candidate", "parameters", "closure alone", "score", "p"
+    absent = "–" * any(entry["closure"] is not None for entry in result["which"])
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
         for name, own in entry["parameters"].items():
@@ -112,7 +114,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
                 values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
             elif own["value"] is not None:
                 values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
-        closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
+        closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
 
@@ -121,19 +123,19 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}')."]
-    if right["of"]:
-        said.append(f"True kind and place in the first answer: {right['count']} of {right['of']} cases with a gap.")
-    if result.get("not_judged"):
-        said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
+    said = [f"The first answer is true in {right['count']} of {right['of']} cases with a gap."] * bool(right["of"])
     if alarms["of"]:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
     if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
         do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
         said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
+    said.append(f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}').")
+    if result.get("not_judged"):
+        said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
     yield from (SummaryStatement(text, "verdict") for text in said)
     yield replace(score, is_key_table=True)
+    yield "-: there is no such case." if any(row[1] == "-" for row in score.rows) else ""
     yield from others
     yield replace(cases, is_page_only=True)
 
@@ -159,24 +161,24 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("number of named effects, on average", _number(result["set_size"], ".2f")),
         ("verdict unknown for effects outside the library", sure["unknown_outside"]),
         ("verdict unknown for effects removed from it", sure["unknown_left_out"]),
-        ("true place first, of both these sorts", sure["unknown_location"]),
+        ("true place first, for these two kinds of effects", sure["unknown_location"]),
         ("both of a pair, each alone or in a set of three", sure["pairs_right"]),
         ("both of a pair, each alone", sure["pairs_named"]),
-        ("closure over that of the true effect refitted", _share(result["closure_of_best"])),
+        ("closure divided by that of the refitted true effects", _share(result["closure_of_best"])),
         ("median error of the effects' parameters", _share(result["parameter_error"], 1)),
-        ("their 95 % intervals that contain the true value", sure["interval_coverage"]),
+        ("95 % intervals of parameters that contain the true value", sure["interval_coverage"]),
         ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
-    seen: TableRows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
+    seen: TableRows = [("size / detectable size", "cases", "gap seen", "kind and place first", "alone or in set of 3")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
-    experiments: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
+    tried: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged", 0)))
-        experiments.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
-    sure_of: TableRows = [("stated probability (mean of a fifth of the cases)", "named sets that hold the cause")]
+        tried.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
+    sure_of: TableRows = [("stated probability (mean of a fifth of the cases)", "true share: sets with the cause")]
     sure_of += [(f"{own['level']:.2f}", _rate(own)) for own in result["calibration"]["probabilities"]]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
@@ -187,8 +189,7 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         place = (", ".join(entry["confusable"]) or "-", "right" if entry["location_first"] else "-")
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
-    tables = {"Score": marks, "Detection by size": seen, "Experiments": experiments, "Probabilities": sure_of}
-    tables["Cases"] = cases
+    tables = {"Score": marks, "Detection by size": seen, "Experiments": tried, "Probabilities": sure_of, "Cases": cases}
     if (rescored := result.get("rescored")) is not None:
         head = ("case", "truth", "then", "now")
         differ: TableRows = [head, *(tuple(own[key] for key in head) for own in rescored["changed"])]
@@ -279,7 +280,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = methods | {"solve": judged}
     stopped = [m for m, e in methods.items() if e["status"] == "iteration_limit" and not e["iterations"]]
     beside = [key for key in ("published", "truth") if result[key]]
-    rows: TableRows = [("parameter", *runs, *beside, "verdict")]
+    rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
     for name, own in judged["parameters"].items():
         if own["free"]:
             cells = []
@@ -291,19 +292,18 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 text = value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"])
                 cells.append("stopped" if method in stopped else text)
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
+            rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
-    objections = [*_objections_to_agreement(result, stopped)]
+    agree = "Use the column `solve`: all methods agree within their ± on the parameters that are found."
+    objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    yield "The method with the lowest cost fits best. Noise alone gives a chi2 per degree of freedom of 1."
+    yield "" if result["disturbed"] else f"The method with the lowest cost, {result['reference']}, fits best."
     yield from (f"{n} did not converge: {e['message']}." for n, e in methods.items() if e["status"] != "converged")
     yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from (f"{sentence}." for sentence in result["explained"])
-    agree = "" if objections else "All methods agree within their uncertainty on the parameters that are found."
-    yield SummaryStatement(agree, "conclusion")
 
 
 def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]) -> Iterator[str]:
@@ -313,7 +313,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
-        yield "Use the column `solve`, which includes this noise. The verdicts belong to it."
+        yield "Use the column `solve`, which includes this noise and has the verdicts."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
@@ -330,30 +330,27 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
         yield "No parameter can be found from these recordings, so there is nothing to agree on."
         yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help."
     elif not result["agree"]:
-        yield "The methods do not agree: use the one with the lowest cost. The reasons are below the tables."
+        yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
     yield "", *methods
-    yield "status", *(entry["status"] for entry in entries)
+    yield "status", *(entry["status"].replace("_", " ") for entry in entries)
     yield "cost (whitened)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
-    chi2 = "chi2 per degree of freedom"
+    chi2 = "chi2 per degree of freedom (noise alone: 1)"
     yield chi2, *("unknown" if (x := e["fit"]["chi2_per_dof"]) is None else f"{x:.3g}" for e in entries)
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
         unit = channel_or_group_unit(units, channel)
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
         cells = (value_text_and_display_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
-        yield f"held out: {channel}" + (f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""), *cells
-    for words, key, form in (
-        ("iterations", "iterations", "d"),
-        ("evaluations", "evaluations", "d"),
-        ("wall time [s]", "wall_seconds", ".2f"),
-        ("CPU time [s]", "cpu_seconds", ".2f"),
-        ("peak memory [MiB]", "peak_memory_mib", ".0f"),
-    ):
-        yield words, *(f"{entry[key]:{form}}" for entry in entries)
+        shown = f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""
+        yield f"held-out rms error of {channel}{shown}", *cells
+    yield from ((key, *(str(entry[key]) for entry in entries)) for key in ("iterations", "evaluations"))
+    for words, key in (("wall time [s]", "wall_seconds"), ("CPU time [s]", "cpu_seconds")):
+        yield words, *(f"{entry[key]:.2f}" for entry in entries)
+    yield "peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)
 
 
 @register_summary("yid-history/1")

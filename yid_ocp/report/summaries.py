@@ -231,16 +231,28 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
+    found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
+    said = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    said += f": {abbreviated_names_text(found)}" * bool(found)
+    failed = "Do not use the values, because the fit did not converge. At these values, "
+    failed *= result["status"] not in ("converged", "not_solved")
+    yield SummaryStatement(f"{failed}{'At the initial values, ' * is_initial}{said}.", "conclusion")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
+    yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
+    hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
     yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
-    cure = "To find them, record other motions (`yid-ocp plan`). If the value of one is known, fix it instead:"
-    yield f"{cure} --set parameters.NAME.free=false --set parameters.NAME.initial=VALUE." if hidden else ""
+    lost = [name for name, entry in parameters.items() if entry["verdict"] in ("weak", "not_identifiable")]
+    if lost:
+        name = f"parameters.{(unseen or lost)[0]}"
+        yield "A parameter that cannot be found has no value (–). To find more, record other motions (`yid-ocp plan`)."
+        yield f"To fix a parameter whose value is known, add --set {name}.free=false --set {name}.initial=VALUE."
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
     if is_initial:
-        yield "These values are initial ones, with the ± near them. For estimates with intervals, omit --initial."
+        yield "For estimates with intervals, omit --initial."
     elif not result["profiles"]:
         yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
@@ -258,10 +270,6 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             rows.append((entry["words"], count, gain))
         yield SummaryTable(rows, "What another experiment would identify")
         yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
-    found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    text = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
-    text += ", at the values of a fit that did not converge" * (result["status"] not in ("converged", "not_solved"))
-    yield SummaryStatement(f"{text}.", "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}."
     yield SummaryStatement(said if lost else "", "verdict")
@@ -275,7 +283,16 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
         rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
-    fitted, friction = result["laws"][best]["parameters"], result["friction_parameters"]
+    chosen = result["laws"][best]
+    fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
+    joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
+    worst, noise = max(entry["mean_error"] for entry in result["laws"].values()), "; noise alone: 1" * (unit == "std")
+    text = f"For {joints}, use the law '{best}'. Its held-out error is {error} (worst law: {worst:.3g}{noise}). It is "
+    text += f"the simplest law within one standard error of the best. Each motion was held out in turn: {kinds}."
+    failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
+    yield SummaryStatement(text + failed, "conclusion")
+    if unit == "std" and chosen["mean_error"] > _MAX_NOISE_RATIO:
+        yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
     told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
@@ -288,13 +305,9 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = f"These recordings do not determine the following parameters: {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
-    yield "Noise alone gives 1 std. If all errors are far larger, run `yid-ocp diagnose`." if unit == "std" else ""
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
-    joints = abbreviated_names_text(result["joints"])
-    text = f"For {joints}, use the law '{best}', the simplest one whose held-out error is within one standard error of "
-    text += f"the smallest. Each kind of motion was held out in turn: {', '.join(result['kinds'])}."
-    yield SummaryStatement(text, "conclusion")
+    yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
     if not result["to_use"]:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
     yield from copyable_estimates_blocks(result)
@@ -461,19 +474,13 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    said += " They show an instability of the motion there. While simulations succeed, nothing need be done."
-    yield SummaryStatement(said if radius > 1 + 1e-6 else said.partition(" They")[0], "verdict")
+    said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
+    yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    seen = (
-        f" 'Observed' ones move a sensor, and one reading is within {seconds:.2g} s from equilibrium."
-        if seconds
-        else ""
-    )
-    yield (
-        "The table states which equations of one time step contain a parameter (del: motion of a coordinate, p1: its "
-        "momentum after the step), and how much one unit of it changes the readings, in standard deviations of noise "
-        f"(std).{seen}"
-    )
+    begun = f" Of one reading, it is the largest within {seconds:.2g} s of equilibrium." if seconds else ""
+    text = "The table has the equations of a time step that contain a parameter (del: motion of a coordinate, p1: its "
+    text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
+    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std).{begun}"
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 else ""

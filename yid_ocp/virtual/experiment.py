@@ -230,11 +230,9 @@ def _how_it_was_made(experiment: VirtualExperimentSettings, system: System) -> s
     simulation = experiment.simulation
     held = 1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample)
     control = "commands of position servos" if system.servos else "torque"
-    return (
-        f"Virtual experiment in MuJoCo {import_mujoco().__version__} (implicitfast, "
-        f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints from static "
-        f"equilibrium, {control} held over each {held:g} ms, seed {experiment.seed}."
-    )
+    made = f"MuJoCo {import_mujoco().__version__} (implicitfast, {1e3 * simulation.time_step:g} ms inner step)"
+    motion = f"multi-sine motion of {len(system.driven)} joints from static equilibrium"
+    return f"Virtual experiment in {made}: {motion}, {control} held over each {held:g} ms, seed {experiment.seed}."
 
 
 def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:

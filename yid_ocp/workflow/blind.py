@@ -349,18 +349,12 @@ class _ExperimentVariation:
 
 EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
     "as_configured": _ExperimentVariation(0.4, "as the configuration has it, torques exact"),
-    "torque_noise": _ExperimentVariation(
-        0.2, "torques with noise and offsets", has_torque_noise=True, friction="stribeck"
-    ),
+    "torque_noise": _ExperimentVariation(0.2, "noisy torques with offsets", has_torque_noise=True, friction="stribeck"),
     "several_recordings": _ExperimentVariation(0.1, "three recordings to estimate on", n_recordings=3, friction="load"),
     "finer_integration": _ExperimentVariation(0.1, "the other engine's step halved", time_step_factor=0.5),
     "bare_arm": _ExperimentVariation(0.1, "the arms alone, driven", has_torque_noise=True, is_without_object=True),
     "bare_arm_efforts": _ExperimentVariation(
-        0.1,
-        "the arms alone, moved as measured",
-        has_torque_noise=True,
-        is_without_object=True,
-        has_prescribed_arms=True,
+        0.1, "the arms, moved as measured", has_torque_noise=True, is_without_object=True, has_prescribed_arms=True
     ),
 }
 """Variations by name. An experiment has the name `CONFIGURATION.VARIATION`."""

@@ -52,7 +52,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
                 for _ in range(1 + len(kinds)):
                     parts.count_done(f"{law} could not be fitted: {solution.message}")
                 continue
-            parts.count_done(law)
+            parts.count_done(f"{law} is fitted to all motions")
             fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:

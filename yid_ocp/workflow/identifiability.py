@@ -126,7 +126,7 @@ def run_identifiability(
             if isinstance(wanted, str):
                 wanted = names if wanted == "all" or (solution and is_small_enough_for_profiles(problem)) else ()
             if tasks is not None and wanted and set(wanted) <= set(names):
-                progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+                progress.begin_stage(f"computing 95 % intervals of {len(wanted)} parameters")
                 information = tasks.with_profile_likelihoods(information, wanted)
             elif wanted:
                 information = judged(intervals=wanted, progress=progress)

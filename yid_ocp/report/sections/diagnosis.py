@@ -116,10 +116,10 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
         f"What the effects leave is mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
         "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
-        "change over time, are added to the model, as few as explain the residual. They explain "
+        "change over time, are added, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
-        f"{evidence['plant']:.4g} with mechanics alone, by {evidence['sensor']:.4g} with sensors alone, and by "
-        f"{evidence['both']:.4g} with both. An alternative that is lower by 5 has odds of 1 to 150.",
+        f"{evidence['plant']:.0f} with mechanics, {evidence['sensor']:.0f} with sensors, {evidence['both']:.0f} with "
+        "both. An alternative that is lower by 5 has odds of 1 to 150.",
     ]
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
@@ -129,10 +129,8 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         figure, sentence = _time_map(finding, smoothed, i, kept)
         maps.append((f"Recording {trace.recording}, {_NOMINAL_LABEL}", figure))
         sentences += [sentence] if i == 0 else []
-    if maps:
-        sentences.append("Each row of a map has one of these unknowns over time. Red is positive, blue is negative.")
-    else:
-        sentences.append("None of these unknowns explains the residual better than chance, so there is no map.")
+    drawn = "Each row of a map has one of these unknowns over time. Red is positive, blue is negative."
+    sentences.append(drawn if maps else "None of these unknowns explains more than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
         sentences.append(f"The file trajectories.h5 has values for all {len(smoothed.smoothed_unknowns)} recordings.")
     return "Where and when the gap arises", sentences, maps
@@ -160,10 +158,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
         prior = np.sqrt([smoothed.group_variance[source] for source in groups])
         values = trace.posterior_mean / np.where(prior > 0, prior, np.nan)
         axis = "value in standard deviations of its prior"
-        sentence = (
-            "The recordings determine no single value (none has less than half of its prior variance), so colours show "
-            "values in standard deviations of the prior. The map is only a hint."
-        )
+        sentence = "The recordings determine no single value. Colours show values in standard deviations of the prior. "
+        sentence += "The map is only a hint."
     rows = []
     for k in kept:
         spans = [f"{edges[j]:.2f} to {edges[j + 1]:.2f} s" for j in range(len(mean))]
@@ -180,14 +176,9 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
     events = finding.events
     if not events:
         return None
-    sentences = [
-        "Points show, over time, the force or torque that the model lacks, as estimated from the recording. The points "
-        "of a correct model lie between the grey lines. Shaded windows are events, with their shape as a line. The "
-        "results below are without events where possible."
-        if events.force_estimates
-        else "",
-        *overspeed_truncation_messages(finding),
-    ]
+    drawn = "Points show the force or torque that the model lacks. Points of a correct model lie between grey lines. "
+    drawn += "Shaded windows are events, with their shape as a line. Where possible, the results below leave them out."
+    sentences = [drawn * bool(events.force_estimates), *overspeed_truncation_messages(finding)]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
         found = [event for event in events.events_of_recording(force.recording) if event.channel == force.coordinate]
@@ -230,10 +221,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     refitted = ", ".join(own.effects[0].label for own in finding.single_effect_models)
     why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
     unmeasured = f"Refitted: {refitted}. Held-out motions cannot show how much of the gap these effects close{why}."
-    sentences = [
-        f"Bars show {promise}",
-        unmeasured if refitted else "No predicted decrease is large enough for a refit.",
-    ]
+    sentences = [f"Bars show {promise}", unmeasured if refitted else "No effect promises enough for a refit."]
     if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
@@ -261,16 +249,14 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
         words = (f"{table.quantity} [{TORQUE_LAW_QUANTITY_UNITS[table.quantity]}]", "torque [N m]")
         visited = law.visited_range[table.quantity]
         shown.append((law.location, figures.estimated_curve_figure((at, torque, std), nearest, visited, *words)))
-    rival = law.runner_up
+    rival, is_simple = law.runner_up, bool({"angle", "speed"} & {*law.visited_range})
+    use = f"{{kind: law, location: {law.location}, depends_on: {law.depends_on}, law_csv: law.csv}}"
     sentences = [
         law.sentence,
-        "The band is two standard deviations. Dotted lines bound the range that the recordings cover. The law is "
-        "constant beyond the ends of the curve."
-        + " The dashed line is the nearest spring or friction law."
-        * bool({"angle", "speed"} & {*law.visited_range}),
-        f"The next best law, of {rival[1]} at {rival[0]}, removes {100 * rival[2]:.3g} %." if rival else "",
-        "The file law.csv has this law. To use it in a model, add this under model.effects: "
-        f"{{kind: law, location: {law.location}, depends_on: {law.depends_on}, law_csv: law.csv}}.",
+        "The band is two standard deviations. Dotted lines bound the recorded range. Beyond it the law is constant.",
+        "The dashed line is the nearest spring or friction law." * is_simple,
+        f"The next best law, of {rival[1]} at {rival[0]}, would remove {100 * rival[2]:.3g} %." if rival else "",
+        f"To use the law (file law.csv) in a model, add this under model.effects: {use}.",
     ]
     return "A torque law for the gap", sentences, shown
 
@@ -347,12 +333,10 @@ def _curves(
         by_recording.setdefault(recording, []).extend(pair)
     shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
-    sentences = [
-        f"Of {count} held-out coordinates or joints, the figures show the {min(count, _MAX_CHANNELS)} that {what}. "
-        "Below each is the error, with two standard deviations of the sensor noise shaded. The error of a correct "
-        "model is inside for 95 % of the time, unless errors of the torques also move the arm."
-    ]
-    return "Measured and predicted", sentences, shown
+    drawn = f"Of {count} held-out coordinates or joints, the figures show the {min(count, _MAX_CHANNELS)} that {what}. "
+    drawn += "Below each is the error, with two standard deviations of the sensor noise shaded. The error of a correct "
+    drawn += "model is inside for 95 % of the time, unless errors of the torques also move the arm."
+    return "Measured and predicted", [drawn], shown
 
 
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
@@ -368,9 +352,6 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     shown = _figures_by_model(rows, "value", "fitted without the effects")
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
-    sentences = [
-        "In a fit without the effects, free parameters change to imitate them. The figure shows this change. Bars are "
-        "two standard deviations, cut at the edge of the figure.",
-        f"{said}." if said else "No parameter changes by more than 10 %.",
-    ]
+    drawn = "A fit without the effects changes free parameters to imitate them. Bars are two standard deviations."
+    sentences = [drawn, f"{said}." if said else "No parameter changes by more than 10 %."]
     return "Parameters that imitated the effects", sentences, shown
