@@ -39,7 +39,7 @@ PARSED_ONLY = {
 COSTLY = (
     r"(check|solve|diagnose|identifiability|compare|inspect|friction|plan|track) configs/(?!springs).*",
     r"(solve|diagnose)( --out \S+)?|(solve|diagnose) (run|cable|again)\.yaml|check cable\.yaml",
-    r"export found .*|batch .* --command diagnose .*|blind --join .*",
+    r"export found .*|batch .* --command diagnose .*",
 )
 """Patterns of the commands that only the slow tests run."""
 UNFINISHED = ("solve configs/servo_arm.yaml", "solve cable.yaml")

@@ -83,7 +83,9 @@ def score_joined_slices(
         for name, values in (("answers", dict(zip(cases, part["answers"], strict=True))), ("best", part["best"])):
             for case, value in values.items():
                 write_strict_json(folder / name / f"{case}.json", {"name": case, "value": value})
-    runs = [load_config(folder / "configs" / f"{name}.yaml") for name in first["configs"]]
+    # only a calibration needs its settings, whose keys may be those of an earlier version
+    needed = first["configs"] if first["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] else ()
+    runs = [load_config(folder / "configs" / f"{name}.yaml") for name in needed]
     return score_whole_ensemble(found, folder, runs, progress)
 
 
