@@ -460,8 +460,7 @@ def held_out_loss(
         blocks = []
         for samples in episode.measurements:
             used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
-            block = np.trunc(times / length).reshape(len(times), -1)
-            blocks.append(np.broadcast_to(block, used.shape)[used])
+            blocks.append(np.broadcast_to(np.trunc(times / length).T, used.T.shape).T[used])
         own, block = np.unique(np.concatenate(blocks), return_inverse=True)
         numbered.append(count + block)
         count += len(own)
