@@ -56,7 +56,7 @@ CRITERIA = {
     "significant effects": (select, "_is_needed", "is_clear and all(", "is_clear or not all("),
     "two thirds of a small gap": (verdict, "_explained_fraction", "min(least, limits", "min(math.inf, limits"),
     "small gaps": (verdict, "_explained_fraction", "1.0 if fits_to_noise and", "1.0 if False and"),
-    "size is determined": (verdict, "_verdict", "bool(said.undetermined_sizes(limits))", "False"),
+    "size is determined": (verdict, "_reasons_against", "bool(said.undetermined_sizes(limits))", "False"),
 }
 """Conditions in code: module, function, the text and what replaces it."""
 

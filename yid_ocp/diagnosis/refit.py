@@ -126,6 +126,11 @@ class RefitStatistics(StoredFit):
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
     @property
+    def excess_chi2(self) -> float:
+        """The excess of r'r of the estimation recordings over the number of residuals, which noise alone gives."""
+        return 2 * self.cost - self.residual_count
+
+    @property
     def total_effect_parameter_count(self) -> int:
         """The number of parameters of all effects in the model together."""
         return sum(len(effect.parameters) for effect in self.effects)
