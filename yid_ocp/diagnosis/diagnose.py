@@ -114,7 +114,7 @@ class _Examined:
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
     truncated: tuple[HeldOutTruncation, ...]
-    with_events: RefitContext  # the data before events were removed
+    with_events: AllCandidatesProblem  # before events were removed from the data
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
@@ -134,7 +134,7 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal, known)
     search.record_stage_end_time("nominal")
     search.progress.begin_stage("looking for events (pushes and wrong samples)", 4.0, 11.5)
-    with_events = search
+    with_events = search.problem
     search, nominal, events, smoothed = _without_events(search, nominal)
     search.record_stage_end_time("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
@@ -182,10 +182,20 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) ->
 
 
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
-    h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
-    search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
-    search = search.restarted_with(search.problem.with_time_step(h), search.store)
-    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
+    h = seen.nominal.problem.step.time_step / 2
+    seen.search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
+    # the recordings are whole again, with their own data
+    anew = replace(seen, truncated=(), is_corrected_for_links=False, removed=seen.removed + fall)
+    return _restarted(anew, seen.with_events.with_time_step(h), seen.nominal.values, seen.search.store)
+
+
+def _restarted(
+    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore = NO_REFIT_STORE
+) -> _Examined:
+    """The nominal model, examined again on another problem; `seen` tells what has been changed before."""
+    search = seen.search.restarted_with(problem, store)
+    told = seen.truncated, seen.is_corrected_for_links, seen.removed
+    return _examined(search, _fitted_nominal_model(search, start), *told)
 
 
 def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
@@ -205,17 +215,11 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
 
 def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:
     """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    problem = seen.with_events.problem.with_encoder_noise_in_efforts(fit.effects, fit.values)
+    problem = seen.with_events.with_encoder_noise_in_efforts(fit.effects, fit.values)
     if problem is None:
         return None
     seen.search.progress.begin_stage(f"starting again with noise beside {hypotheses.join_effect_labels(fit.effects)}")
-    return _examined_with(seen, problem)
-
-
-def _examined_with(seen: _Examined, problem: AllCandidatesProblem) -> _Examined:
-    """The nominal model, examined again with other noise or priors."""
-    search, told = seen.with_events.restarted_with(problem), (seen.truncated, seen.is_corrected_for_links, seen.removed)
-    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), *told)
+    return _restarted(seen, problem, seen.nominal.values)
 
 
 def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -> AllCandidatesProblem:
@@ -247,7 +251,7 @@ def _with_changed_parameters(
     if judged.accepted_selected_effects and difference > -1.0:
         return None, judged.with_confusable_parameter_changes(released, difference)
     with contextlib.suppress(SolverError):
-        anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
+        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
             return anew, judged
     return None, judged
@@ -263,7 +267,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
     rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
     pairs = zip((fit.evaluation.residual, left), rows, strict=True)
-    before, after = ([float(r[at] @ r[at]) - np.count_nonzero(r[at]) for at in part] for r, part in pairs)
+    before, after = ([_excess_of(r[at]) for at in part] for r, part in pairs)
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
@@ -284,22 +288,20 @@ def _with_errors_of_step_and_encoders(
 
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
-    search = seen.with_events
-    search.progress.begin_stage("trying twice the links", 1.0, 11.0)
-    own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
-    known = search.problem.problem, own, fit.unknowns, fit.evaluation
+    seen.search.progress.begin_stage("trying twice the links", 1.0, 11.0)
+    own = seen.with_events.problem_with_nominal_and_effects_free(fit.effects)
+    known = seen.with_events.problem, own, fit.unknowns, fit.evaluation
     corrected = discretisation.problem_data_corrected_for_few_links(*known, fit.effects, least)
     if corrected is None:
         return None
-    problem = replace(search.problem, problem=corrected)
+    problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return None
     gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
-    search.progress.begin_stage(said)
-    search = search.restarted_with(problem)
-    return _examined(search, _fitted_nominal_model(search, refitted.values), seen.truncated, True, seen.removed + gain)
+    seen.search.progress.begin_stage(said)
+    return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
 
 
 def _followed(
@@ -347,39 +349,41 @@ def _happened(
     """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
     guesses = fit.evaluation.equilibrium_guesses
-    judged, residual = fit.problem, fit.evaluation
-    pairs, parts = zip(judged.episodes, own.episodes, strict=True), ("torque", "measurements")
-    if is_other := any(getattr(a, part) is not getattr(b, part) for a, b in pairs for part in parts):
-        judged = problem_with_whitening_at(own, x, guesses)
-        residual = judged.evaluate(x, False, guesses)
-    if not residual.ok:
+    pairs, parts = zip(fit.problem.episodes, own.episodes, strict=True), ("torque", "measurements")
+    has_same_data = all(getattr(a, part) is getattr(b, part) for a, b in pairs for part in parts)
+    judged = fit.problem if has_same_data else problem_with_whitening_at(own, x, guesses)
+    tested = judged.evaluate(x, False, guesses)
+    if not tested.ok:
         return NO_EVENTS, None
-    test = _null_test(judged, residual.residual, len(fit.values), limits)
-    is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = residual
-    if (is_other and is_flagged) or own.has_process_noise:
-        evaluation = own.evaluate(x, is_flagged, guesses)
+    windows = _null_test(judged, tested.residual, len(fit.values), limits).windows
+    is_flagged = any(window.is_flagged for window in windows)
+    evaluation = own.evaluate(x, is_flagged, guesses)
     if not evaluation.ok:
         return NO_EVENTS, None
     least = limits.min_log_bayes_factor
     smoothed = smoother.smooth_unknown_forces_and_biases(own, x, evaluation, least) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION
-    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
+    pushed, others = found.split_force_from_other_events()
+    left = 1 - _MIN_FORCE_EVENT_GAP_FRACTION
+    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > left * _excess(fit, own):
         found = others
     return found, smoothed
 
 
+def _excess_of(residual: Array) -> float:
+    """r'r of a whitened residual (n,) minus the number of used samples, which noise alone gives."""
+    return float(residual @ residual) - np.count_nonzero(residual)
+
+
 def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
-    """r'r of a fit minus the number of used samples, over all recordings; infinite if they cannot be predicted."""
+    """Excess of the residual of a fit over noise, in all recordings; infinite if they cannot be predicted."""
     x, guesses = problem.pack_unknowns(fit.values), fit.evaluation.equilibrium_guesses
     judged = problem_with_whitening_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
     if evaluation.ok:
         with contextlib.suppress(SolverError):
             held_out = [part.residual for part in _held_out_residuals(judged, judged.predict_held_out(x))]
-            r = np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out])
-            return float(r @ r) - np.count_nonzero(r)
+            return _excess_of(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
     return math.inf
 
 
@@ -422,7 +426,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
-        events = _happened(seen.with_events.problem.problem_fitting_all_samples, final, limits)[0]
+        events = _happened(seen.with_events.problem_fitting_all_samples, final, limits)[0]
     search.record_stage_end_time("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
