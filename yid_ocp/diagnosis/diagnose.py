@@ -28,7 +28,6 @@ from yid_ocp.diagnosis.refit import (
     HeldOutPredictions,
     NominalSolutionAndRefitStore,
     RefitContext,
-    RefitStatistics,
     RefitStore,
     RefittedModel,
     held_out_loss,
@@ -139,16 +138,14 @@ def _examined(
     search.record_stage_end_time("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_from_states(states)
-    predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
-    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits, predicted)
+    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits)
     tests = _estimation_null_test(nominal, limits), held_out_test
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
-    loss = held_out_loss(own, nominal.unknowns, nominal.evaluation, spread, predicted)
+    loss = held_out_loss(own, nominal.unknowns, nominal.evaluation, spread)
     nominal = replace(nominal, held_out_loss=loss)
-    del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
@@ -203,23 +200,19 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
     fits = [entry.refitted_model for entry in judged.selected_effects]
     if not fits:
         return None
-    if judged.verdict == "unknown" and (noisier := _with_noise_beside_effects(seen, fits[-1])):
-        return noisier
-    fit = fits[max(len(fits) - 2, 0)]  # the last of several effects may correct the error of the discretisation
+    if judged.verdict == "unknown":
+        problem = seen.with_events.with_encoder_noise_in_efforts(fits[-1].effects, fits[-1].values)
+        if problem is not None:
+            beside = hypotheses.join_effect_labels(fits[-1].effects)
+            seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
+            return _restarted(seen, problem, seen.nominal.values)
+    fit = fits[-2:][0]  # the last of several effects may correct the error of the discretisation
     scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
-    again = scores and refit_with_effects(seen.search.problem, fit.effects, fit.values)
-    if not scores or not again:
+    if scores is None:  # the effects leave only noise
         return None
-    return _at_finer_discretisation(seen, again, scores.largest_predicted_chi2_decrease)
-
-
-def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:
-    """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    problem = seen.with_events.with_encoder_noise_in_efforts(fit.effects, fit.values)
-    if problem is None:
-        return None
-    seen.search.progress.begin_stage(f"starting again with noise beside {hypotheses.join_effect_labels(fit.effects)}")
-    return _restarted(seen, problem, seen.nominal.values)
+    assert isinstance(fit, RefittedModel)
+    fit = reevaluate_refit_with_all_candidates(seen.search.problem, fit)
+    return _at_finer_discretisation(seen, fit, scores.largest_predicted_chi2_decrease)
 
 
 def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -> AllCandidatesProblem:
@@ -517,11 +510,11 @@ def _held_out_residuals(problem: EstimationProblem, predicted: HeldOutPrediction
 
 
 def _held_out_null_test_and_spread(
-    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS, predicted: HeldOutPredictions = ()
+    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS
 ) -> tuple[NullTestResult, Array]:
     """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
     problem, x, shared = fit.problem, fit.unknowns, len(fit.problem.shared_parameters)
-    predicted, filters = predicted or problem.predict_held_out(x, True), problem.held_out_whitening_filters
+    predicted, filters = problem.predict_held_out(x, True), problem.held_out_whitening_filters
     own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
 
     def residual_of(moved: EstimationProblem) -> Array | None:
