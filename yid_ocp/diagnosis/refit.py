@@ -164,6 +164,11 @@ class RefittedModel(RefitStatistics):
         """The fitted values of the problem's unknowns, shape (nx,)."""
         return self.problem.pack_unknowns(self.values)
 
+    @property
+    def at_estimates(self) -> tuple[EstimationProblem, Array, Evaluation]:
+        """The problem, the fitted values of its unknowns, shape (nx,), and its evaluation there."""
+        return self.problem, self.unknowns, self.evaluation
+
 
 @dataclass(frozen=True)
 class EffectSearchRecord:

@@ -127,6 +127,11 @@ def residual_chi2_null_test(
     return NullTestResult(ratio, effective, p_value, channels, _windows(series, residual, level, window))
 
 
+def excess_over_sample_count(residual: Array) -> float:
+    """Return r'r of a whitened residual (n,) minus the number of used samples, which noise alone gives."""
+    return float(residual @ residual) - np.count_nonzero(residual)
+
+
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
 
