@@ -160,7 +160,7 @@ def _examined(
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined:
     """The nominal model, examined again at half the time step or without the error of the links.
 
-    `seen` if neither lowers r'r of a fit significantly and by half of what a candidate would (`gap`), or after the links.
+    `seen` if neither lowers r'r of a fit significantly and by half of a candidate's fall (`gap`), or after the links.
     """
     if seen.is_corrected_for_links:
         return seen
