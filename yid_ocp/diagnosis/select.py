@@ -224,10 +224,10 @@ def select_effects(
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
     fits = refit_with_each_effect(search, (), shortlist, nominal.values)
     if moved:
-        dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
-        fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
-    near = _near_best_models(nominal, fits, limits)
-    first = sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
+        fits = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
+    single = {fit.effects[0].label: fit for fit in fits}  # of two fits the one that costs less, which is the last
+    near = _near_best_models(nominal, list(single.values()), limits)
+    best = next((fit.effects[0].label for fit, _ in near), "")
     while better := next((fit for fit, _ in near if _is_needed(chosen, fit, limits)), None):
         # untried confusable candidates cannot be excluded yet
         label = better.effects[-1].label
@@ -236,7 +236,8 @@ def select_effects(
         tried = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.effects]
         rivals[label] = [*tried, *untried]
         before, chosen = chosen, better
-        base, beside = better.effects, join_effect_labels(better.effects)
+        base = better.effects
+        beside = join_effect_labels(base)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
@@ -257,17 +258,17 @@ def select_effects(
         near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before, rivals)
     if len(chosen.effects) == 1:
-        # its last fit may differ from its first one
-        first = [chosen, *(fit for fit in first if fit.effects != chosen.effects)]
+        best = chosen.effects[0].label
+        single[best] = chosen  # it may differ from the first fit
+    known = {join_effect_labels(fit.effects): fit for fit in (*single.values(), chosen)}
     added = []
     for i, effect in enumerate(chosen.effects, 1):
-        known = next((fit for fit in (chosen, *first) if fit.effects == chosen.effects[:i]), None)
-        again = f"{join_effect_labels(chosen.effects[:i])} again"
-        fit = known or search.refit(chosen.effects[:i], chosen.values, again) or chosen
+        name = join_effect_labels(chosen.effects[:i])
+        fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
         closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
         added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
-    return tuple(first), tuple(added)
+    return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)
 
 
 def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
