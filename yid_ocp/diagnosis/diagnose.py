@@ -231,11 +231,12 @@ def _with_changed_parameters(
             break
         fit, released = refitted, tried
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
-    difference = select.bic_difference_per_threshold(fit, best, len(released), search.thresholds)
-    if not released or difference > 1.0:
+    decisive = select.decisive_bic_difference(search.thresholds)
+    distance = select.bic_difference(fit, best, len(released)) / decisive
+    if not released or distance > 1.0:
         return seen, judged
-    if judged.accepted_selected_effects and difference > -1.0:
-        return seen, judged.with_confusable_parameter_changes(released, difference)
+    if judged.accepted_selected_effects and distance > -1.0:
+        return seen, judged.with_confusable_parameter_changes(released, distance)
     with contextlib.suppress(SolverError):
         anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
@@ -337,7 +338,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         shifted = earlier.shifted_parameters_with_prior(nominal, limits)
         evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
         judged = judge(search, evidence)
-        if not time.perf_counter() < search.deadline:  # a search that begins anew would find nothing
+        if search.is_skipped_past_deadline():  # a search that begins anew would find nothing
             break
         seen, judged = _with_changed_parameters(seen, judged, earlier)
         if seen is before:

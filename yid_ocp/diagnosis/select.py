@@ -111,18 +111,14 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int = 0) 
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
-def bic_difference_per_threshold(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
-    """Compute the BIC of `fit`, which has `more` parameters beside its effects', minus that of `other`; ±1 decides."""
-    return bic_difference(fit, other, more) / _decisive_bic_difference(limits)
-
-
-def _decisive_bic_difference(limits: Thresholds) -> float:
+def decisive_bic_difference(limits: Thresholds) -> float:
+    """Return the difference of BIC from which on the recordings tell two models apart."""
     return 2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor
 
 
-def relative_probability(bic_difference: float) -> float:
-    """Compute the probability of a model beside another one with a BIC that is larger by a relative difference."""
-    return 1.0 / (1.0 + math.exp(-_LOG_ODDS_PER_DISTANCE * bic_difference))
+def relative_probability(distance: float) -> float:
+    """Compute the probability of a model beside another one, whose BIC is larger by `distance` decisive differences."""
+    return 1.0 / (1.0 + math.exp(-_LOG_ODDS_PER_DISTANCE * distance))
 
 
 def _near_best_models(
@@ -139,7 +135,7 @@ def _near_best_models(
         # errors of the models' responses leave a part of what the best one explains; a test would find a std of chi2
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
-        decisive = max(_decisive_bic_difference(limits), errors)
+        decisive = max(decisive_bic_difference(limits), errors)
         distances = [bic_difference(fit, best) / decisive for fit in fits]
         ranks = [(distance, 0.0) for distance in distances]
     else:

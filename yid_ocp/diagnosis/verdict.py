@@ -111,9 +111,9 @@ class Judgement:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
-    def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
-        """Return this judgement if changes explain as much (BIC difference: `select.bic_difference_per_threshold`)."""
-        rivals, probability = tuple(names), self.probability * select.relative_probability(bic_difference)
+    def with_confusable_parameter_changes(self, names: Sequence[str], distance: float) -> Judgement:
+        """Return this judgement if changes explain as much, at a distance as in `select.relative_probability`."""
+        rivals, probability = tuple(names), self.probability * select.relative_probability(distance)
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
