@@ -131,13 +131,13 @@ def _near_best_models(
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
-        best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
+        ranked = sorted(fits, key=lambda fit: bic_difference(fit, nominal))
+        best = next(iter(ranked), nominal)
         # errors of the models' responses leave a part of what the best one explains; a test would find a std of chi2
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
         decisive = max(decisive_bic_difference(limits), errors)
-        distances = [bic_difference(fit, best) / decisive for fit in fits]
-        ranks = [(distance, 0.0) for distance in distances]
+        distances = [bic_difference(fit, best) / decisive for fit in ranked]
     else:
         sized = [fit for fit in fits if fit.determines_size(fit.effects[-1], limits.min_z)]
         plausible = [fit for fit in sized if not fit.implausible_parameters(fit.effects[-1], limits)]
@@ -145,10 +145,9 @@ def _near_best_models(
         best_plausible = min(plausible, key=_chi2, default=nominal)
         if best_plausible.held_out_loss.excess_chi2_per_sample <= most:
             best, fits = best_plausible, plausible
-        distances = [_distance_in_prediction(fit, best) for fit in fits]
-        ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
-    near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
-    return [(fit, distance) for fit, distance, _ in sorted(near, key=lambda own: own[2])]
+        ranked = sorted(fits, key=lambda fit: (fit.total_effect_parameter_count, _chi2(fit)))
+        distances = [_distance_in_prediction(fit, best) for fit in ranked]
+    return [(fit, distance) for fit, distance in zip(ranked, distances, strict=True) if distance <= 1]
 
 
 def _chi2(fit: RefitStatistics) -> float:
