@@ -271,7 +271,7 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
     claimed = ForceOrFaultEvent("run_1", "elbow", "elbow", "force", 1.0, 1.2, *size, "N m", pulse)
     odd = ForceOrFaultEvent("run_1", "elbow", "points_arm.tip.x", "sample", 2.0, 2.01, *size, "m")
     events = EventSet((claimed, odd))
-    module = sys.modules["yid_ocp.diagnosis.diagnose"]
+    module = sys.modules["yid_ocp.diagnosis.events"]
     monkeypatch.setattr(module, "find_force_and_fault_events", lambda *_: events)
     heavy = [bench.recording({"link_mass@elbow": {"scale": 1.3}}, seed, 2.0) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):

@@ -11,7 +11,7 @@ from made_series import series
 from small_problems import PENDULUM, H, pendulum_step, taken
 
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.screening import _covariance_of_scores, _shape_grid, linearize_candidates, screen_candidates
+from yid_ocp.diagnosis.screening import _shape_grid, linearize_candidates, screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.inference import null_test
 from yid_ocp.inference.null_test import channels_with_residual_indices, encoder_noise_residual_covariance_factor
@@ -160,7 +160,7 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
     columns = np.random.default_rng(1).standard_normal((30, 2))
     parts = [series(range(10, 30), colour=colour), series(range(8))]
     expected = columns[10:].T @ toeplitz(colour, 20) @ columns[10:] + columns[:8].T @ columns[:8]
-    found = _covariance_of_scores(columns, parts)
+    found = null_test.covariance_of_scores(columns, parts)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
     np.testing.assert_array_equal(found, found.T)
 

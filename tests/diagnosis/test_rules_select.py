@@ -377,22 +377,24 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 
 def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
     _, chosen, found = Rounds(monkeypatch, GROWING).compose(max_effects=1)
-    assert (chosen, found[0].extended_models) == (["a"], ())
-    rounds = Rounds(monkeypatch, GROWING | {"ab": (3.1, 3.2), "ac": (3.1, 3.2), "bc": (3.1, 3.2)}, pairs=("bc",))
-    entry = rounds.compose(max_effects=2)[2][0]
-    assert [fit.effects[-1].kind for fit in entry.extended_models] == ["b", "c"]
-    with monkeypatch.context() as patch:
-        patch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
-        assert [fit.effects[-1].kind for fit in rounds.compose(max_effects=2)[2][0].extended_models] == ["c"]
-    name, value = next(iter(entry.refitted_model.values.items()))
-    moved = [
-        replace(fit, values=fit.values | {name: value + by})
-        for fit, by in zip(entry.extended_models, (0.3, -0.4), strict=True)
-    ]
-    for lost, std in ((loss(3.0, 3.2), math.sqrt(0.125)), (loss(1.0, 1.0), 0.01)):
-        own = replace(entry, refitted_model=replace(entry.refitted_model, held_out_loss=lost))
-        found = select.widen_refit_stds_by_model_error(replace(own, extended_models=tuple(moved)), LIMITS)
-        assert found.std[name] == pytest.approx(std)
+    assert (chosen, found[0].model_error_std) == (["a"], {"a@x.a": 0.0})
+    moved = {"ab": 1.3, "ac": 0.6, "bc": 9.0, "abc": 9.0}
+
+    def unsure(**losses):
+        rounds = Rounds(monkeypatch, GROWING | {"ab": (3.1, 3.2), "ac": (3.1, 3.2), "bc": (3.1, 3.2)} | losses)
+        fitted, rounds.pairs = rounds.fit, ("bc",)
+
+        def elsewhere(effects):
+            made, kinds = fitted(effects), "".join(of.kind for of in effects)
+            return replace(made, values=made.values | {"a@x.a": moved.get(kinds, 1.0)})
+
+        monkeypatch.setattr(rounds, "fit", elsewhere)
+        return rounds.compose(max_effects=2)[2][0].model_error_std
+
+    assert unsure() == {"a@x.a": pytest.approx(math.sqrt(0.125))}
+    assert unsure(a=(1.0, 1.0)) == {}, "what leaves only noise"
+    monkeypatch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
+    assert unsure() == {"a@x.a": pytest.approx(0.4)}
 
 
 LITTLE = {"": (1.6, 1.8), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}

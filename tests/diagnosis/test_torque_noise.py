@@ -12,7 +12,7 @@ from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import gap_law
-from yid_ocp.diagnosis.diagnose import _held_out_null_test_and_spread, diagnose, fit_nominal_model
+from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
@@ -22,7 +22,7 @@ from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
-from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt
+from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests_of_fit
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
     problem_with_exact_inputs,
@@ -181,7 +181,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     bare = problem_with_exact_inputs(made.problem)
     plain = bare.evaluate(bare.pack_unknowns(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
-    test, _ = _held_out_null_test_and_spread(fit)
+    _, test, _ = null_tests_of_fit(fit.problem, fit.unknowns, fit.evaluation, 0.01)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 
@@ -191,10 +191,9 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), composed(step, True))
     spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
     off = fit.problem.pack_unknowns(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
-    moved = replace(fit, values=fit.problem.unknowns.named_values(off))
-    assert _held_out_null_test_and_spread(moved)[0].p_value < 1e-12
+    assert null_tests_of_fit(fit.problem, off, fit.evaluation, 0.01)[1].p_value < 1e-12
     less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
-    test, _ = _held_out_null_test_and_spread(replace(moved, evaluation=less))
+    _, test, _ = null_tests_of_fit(fit.problem, off, less, 0.01)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 

@@ -15,20 +15,17 @@ import threadpoolctl
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.run_estimates import RunEstimates
-from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import hypotheses, select
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
+from yid_ocp.diagnosis.events import EventSet, find_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
-    HeldOutPredictions,
     NominalSolutionAndRefitStore,
     RefitContext,
-    RefitStatistics,
     RefitStore,
     RefittedModel,
     held_out_loss,
@@ -42,17 +39,13 @@ from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
-from yid_ocp.inference.null_test import NullTestResult
+from yid_ocp.inference.null_test import excess_over_sample_count
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import effective_parameter_count, noise_only_covariance_sqrt
-from yid_ocp.inference.whitening import problem_with_whitening_at
+from yid_ocp.inference.uncertainty import null_tests_of_fit
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import episode_residual_and_jacobian
-from yid_ocp.problem.measurements import ResidualAndJacobian
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
-_MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _MAX_STEP_OF_LAST_HALVING = 2.5e-3  # step from which on a failure of the model with all candidates is final [s]
@@ -114,7 +107,7 @@ class _Examined:
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
     truncated: tuple[HeldOutTruncation, ...]
-    with_events: RefitContext  # the data before events were removed
+    with_events: AllCandidatesProblem  # before events were removed from the data
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
@@ -134,23 +127,19 @@ def _examined(
     search, nominal, cuts = _followed(search, nominal, known)
     search.record_stage_end_time("nominal")
     search.progress.begin_stage("looking for events (pushes and wrong samples)", 4.0, 11.5)
-    with_events = search
+    with_events = search.problem
     search, nominal, events, smoothed = _without_events(search, nominal)
     search.record_stage_end_time("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_from_states(states)
-    predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
-    held_out_test, spread = _held_out_null_test_and_spread(nominal, limits, predicted)
-    tests = _estimation_null_test(nominal, limits), held_out_test
+    test, held_out_test, spread = null_tests_of_fit(*nominal.at_estimates, limits.significance_level)
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
-    loss = held_out_loss(own, nominal.unknowns, nominal.evaluation, spread, predicted)
-    nominal = replace(nominal, held_out_loss=loss)
-    del predicted  # its derivatives would fill the memory
+    nominal = replace(nominal, held_out_loss=held_out_loss(*nominal.at_estimates, spread))
     least = _LEFT_BY_DISCRETISATION * removed
-    evidence = NominalModelGapEvidence(nominal, *tests, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
+    evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
     search.progress.begin_stage(f"screening {len(effects)} candidate effects", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
@@ -162,18 +151,19 @@ def _examined(
             raise
         return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
     search.record_stage_end_time("screening")
-    evidence = replace(evidence, screening=screened)
-    seen, gap = replace(seen, evidence=evidence), screened.largest_predicted_chi2_decrease
-    return (evidence.warrants_effect_search(limits) and _at_finer_discretisation(seen, nominal, gap)) or seen
+    seen = replace(seen, evidence=replace(evidence, screening=screened))
+    if not seen.evidence.warrants_effect_search(limits):
+        return seen
+    return _at_finer_discretisation(seen, nominal, screened.largest_predicted_chi2_decrease)
 
 
-def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined | None:
+def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined:
     """The nominal model, examined again at half the time step or without the error of the links.
 
-    None if neither lowers r'r of a fit significantly and by half of what a candidate would (`gap`), or after the links.
+    `seen` if neither lowers r'r of a fit significantly and by half of a candidate's fall (`gap`), or after the links.
     """
     if seen.is_corrected_for_links:
-        return None
+        return seen
     fall = _fall_at_half_time_step(seen.search, fit, seen.events)
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
     if fall > least:
@@ -182,40 +172,40 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) ->
 
 
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
-    h, search = seen.nominal.problem.step.time_step / 2, seen.with_events
-    search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
-    search = search.restarted_with(search.problem.with_time_step(h), search.store)
-    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), removed=seen.removed + fall)
+    h = seen.nominal.problem.step.time_step / 2
+    seen.search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
+    # the recordings are whole again, with their own data
+    anew = replace(seen, truncated=(), is_corrected_for_links=False, removed=seen.removed + fall)
+    return _restarted(anew, seen.with_events.with_time_step(h), seen.nominal.values, seen.search.store)
 
 
-def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined | None:
-    """The nominal model, examined again if noise or discretisation need it beside the effects; else None."""
+def _restarted(
+    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore = NO_REFIT_STORE
+) -> _Examined:
+    """The nominal model, examined again on another problem; `seen` tells what has been changed before."""
+    search = seen.search.restarted_with(problem, store)
+    told = seen.truncated, seen.is_corrected_for_links, seen.removed
+    return _examined(search, _fitted_nominal_model(search, start), *told)
+
+
+def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
+    """The nominal model, examined again if noise or discretisation need it beside the effects; else `seen`."""
     fits = [entry.refitted_model for entry in judged.selected_effects]
     if not fits:
-        return None
-    if judged.verdict == "unknown" and (noisier := _with_noise_beside_effects(seen, fits[-1])):
-        return noisier
-    fit = fits[max(len(fits) - 2, 0)]  # the last of several effects may correct the error of the discretisation
+        return seen
+    if judged.verdict == "unknown":
+        problem = seen.with_events.with_encoder_noise_in_efforts(fits[-1].effects, fits[-1].values)
+        if problem is not None:
+            beside = hypotheses.join_effect_labels(fits[-1].effects)
+            seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
+            return _restarted(seen, problem, seen.nominal.values)
+    fit = fits[-2:][0]  # the last of several effects may correct the error of the discretisation
     scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
-    again = scores and refit_with_effects(seen.search.problem, fit.effects, fit.values)
-    if not scores or not again:
-        return None
-    return _at_finer_discretisation(seen, again, scores.largest_predicted_chi2_decrease)
-
-
-def _with_noise_beside_effects(seen: _Examined, fit: RefitStatistics) -> _Examined | None:
-    """The nominal model, examined again with the noise of efforts beside rejected effects; None if it hardly grows."""
-    problem = seen.with_events.problem.with_encoder_noise_in_efforts(fit.effects, fit.values)
-    if problem is None:
-        return None
-    seen.search.progress.begin_stage(f"starting again with noise beside {hypotheses.join_effect_labels(fit.effects)}")
-    return _examined_with(seen, problem)
-
-
-def _examined_with(seen: _Examined, problem: AllCandidatesProblem) -> _Examined:
-    """The nominal model, examined again with other noise or priors."""
-    search, told = seen.with_events.restarted_with(problem), (seen.truncated, seen.is_corrected_for_links, seen.removed)
-    return _examined(search, _fitted_nominal_model(search, seen.nominal.values), *told)
+    if scores is None:  # the effects leave only noise
+        return seen
+    assert isinstance(fit, RefittedModel)
+    fit = reevaluate_refit_with_all_candidates(seen.search.problem, fit)
+    return _at_finer_discretisation(seen, fit, scores.largest_predicted_chi2_decrease)
 
 
 def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -> AllCandidatesProblem:
@@ -226,10 +216,10 @@ def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -
 
 def _with_changed_parameters(
     seen: _Examined, judged: Judgement, earlier: EarlierRunsBaseline
-) -> tuple[_Examined | None, Judgement]:
+) -> tuple[_Examined, Judgement]:
     """The nominal model, examined again without the priors of parameters that have left the earlier runs.
 
-    None if it does not explain the recordings, or decidedly worse than rejected or not decidedly better than accepted
+    `seen` if it does not explain the recordings, or decidedly worse than rejected or not decidedly better than accepted
     effects. Changes that explain as much as accepted effects enter the returned judgement and its probability.
     """
     search, fit, released = seen.search, seen.nominal, list[str]()
@@ -241,29 +231,30 @@ def _with_changed_parameters(
             break
         fit, released = refitted, tried
     best = [seen.nominal, *(entry.refitted_model for entry in judged.selected_effects)][-1]
-    difference = select.bic_difference_per_threshold(fit, best, len(released), search.thresholds)
-    if not released or difference > 1.0:
-        return None, judged
-    if judged.accepted_selected_effects and difference > -1.0:
-        return None, judged.with_confusable_parameter_changes(released, difference)
+    decisive = select.decisive_bic_difference(search.thresholds)
+    distance = select.bic_difference(fit, best, len(released)) / decisive
+    if not released or distance > 1.0:
+        return seen, judged
+    if judged.accepted_selected_effects and distance > -1.0:
+        return seen, judged.with_confusable_parameter_changes(released, distance)
     with contextlib.suppress(SolverError):
-        anew = _examined_with(seen, _without_priors_of(seen.with_events.problem, released))
+        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
             return anew, judged
-    return None, judged
+    return seen, judged
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
     fine = _at_finer_step(search, fit, events)
-    left = discretisation.predicted_refit_residual_at_finer_step(fine, fit.problem, fit.unknowns, fit.evaluation)
+    left = discretisation.predicted_refit_residual_at_finer_step(fine, *fit.at_estimates)
     if left is None:
         return -math.inf
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
     rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
     pairs = zip((fit.evaluation.residual, left), rows, strict=True)
-    before, after = ([float(r[at] @ r[at]) - np.count_nonzero(r[at]) for at in part] for r, part in pairs)
+    before, after = ([excess_over_sample_count(r[at]) for at in part] for r, part in pairs)
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
@@ -277,29 +268,27 @@ def _with_errors_of_step_and_encoders(
     search: RefitContext, fit: RefittedModel, events: EventSet
 ) -> tuple[RefittedModel, bool]:
     """The fit with standard deviations that contain these errors, and whether they could be computed."""
-    found = fit.problem, fit.unknowns, fit.evaluation, fit.std
-    std = discretisation.stds_with_time_step_and_encoder_errors(_at_finer_step(search, fit, events), *found)
+    fine = _at_finer_step(search, fit, events)
+    std = discretisation.stds_with_time_step_and_encoder_errors(fine, *fit.at_estimates, fit.std)
     return (fit, False) if std is None else (replace(fit, std=std), True)
 
 
-def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined | None:
+def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined:
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
-    search = seen.with_events
-    search.progress.begin_stage("testing whether twice the links lower chi2", 1.0, 11.0)
-    own = search.problem.problem_with_nominal_and_effects_free(fit.effects)
-    known = search.problem.problem, own, fit.unknowns, fit.evaluation
+    seen.search.progress.begin_stage("testing whether twice the links lower chi2", 1.0, 11.0)
+    own = seen.with_events.problem_with_nominal_and_effects_free(fit.effects)
+    known = seen.with_events.problem, own, fit.unknowns, fit.evaluation
     corrected = discretisation.problem_data_corrected_for_few_links(*known, fit.effects, least)
     if corrected is None:
-        return None
-    problem = replace(search.problem, problem=corrected)
+        return seen
+    problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
-        return None
+        return seen
     gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
-    search.progress.begin_stage(said)
-    search = search.restarted_with(problem)
-    return _examined(search, _fitted_nominal_model(search, refitted.values), seen.truncated, True, seen.removed + gain)
+    seen.search.progress.begin_stage(said)
+    return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
 
 
 def _followed(
@@ -326,7 +315,7 @@ def _without_events(
 ) -> tuple[RefitContext, RefittedModel, EventSet, SmoothedUnknownsResult | None]:
     """Remove what events explain, refit the nominal model, and examine it again."""
     first, whole = search.problem, search.problem.problem_fitting_all_samples
-    events, smoothed = _happened(whole, nominal, search.thresholds)
+    events, smoothed = find_events(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
         if not events:
             break
@@ -335,73 +324,32 @@ def _without_events(
         search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
         nominal, before = _fitted_nominal_model(search, nominal.values, name), events
         # the smoother's result includes the events
-        events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
+        events, smoothed = find_events(whole, nominal, search.thresholds)[0], None
         if events.has_same_force_and_fault_events(before):
             break
     return search, nominal, events, None if first.is_split_in_blocks else smoothed
 
 
-def _happened(
-    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
-) -> tuple[EventSet, SmoothedUnknownsResult | None]:
-    """Events in all recordings, from a fit's residual (none if the prediction fails), and the smoother's result."""
-    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
-    guesses = fit.evaluation.equilibrium_guesses
-    judged, residual = fit.problem, fit.evaluation
-    pairs, parts = zip(judged.episodes, own.episodes, strict=True), ("torque", "measurements")
-    if is_other := any(getattr(a, part) is not getattr(b, part) for a, b in pairs for part in parts):
-        judged = problem_with_whitening_at(own, x, guesses)
-        residual = judged.evaluate(x, False, guesses)
-    if not residual.ok:
-        return NO_EVENTS, None
-    test = _null_test(judged, residual.residual, len(fit.values), limits)
-    is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = residual
-    if (is_other and is_flagged) or own.has_process_noise:
-        evaluation = own.evaluate(x, is_flagged, guesses)
-    if not evaluation.ok:
-        return NO_EVENTS, None
-    least = limits.min_log_bayes_factor
-    smoothed = smoother.smooth_unknown_forces_and_biases(own, x, evaluation, least) if is_flagged else None
-    found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_force_from_other_events(), 1 - _MIN_FORCE_EVENT_GAP_FRACTION
-    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
-        found = others
-    return found, smoothed
-
-
-def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
-    """r'r of a fit minus the number of used samples, over all recordings; infinite if they cannot be predicted."""
-    x, guesses = problem.pack_unknowns(fit.values), fit.evaluation.equilibrium_guesses
-    judged = problem_with_whitening_at(problem, x, guesses)
-    evaluation = judged.evaluate(x, False, guesses)
-    if evaluation.ok:
-        with contextlib.suppress(SolverError):
-            held_out = [part.residual for part in _held_out_residuals(judged, judged.predict_held_out(x))]
-            r = np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out])
-            return float(r @ r) - np.count_nonzero(r)
-    return math.inf
-
-
 def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRunsBaseline) -> DiagnosisResult:
-    anew: _Examined | None = seen
-    while anew:  # no recursion, which would keep what was found before
-        seen = anew
+    before: _Examined | None = None
+    while seen is not before:  # no recursion, which would keep what was found before
+        before = seen
         search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
         shifted = earlier.shifted_parameters_with_prior(nominal, limits)
         evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
         judged = judge(search, evidence)
-        if not time.perf_counter() < search.deadline:  # a search that begins anew would find nothing
+        if search.is_skipped_past_deadline():  # a search that begins anew would find nothing
             break
-        anew, judged = _with_changed_parameters(seen, judged, earlier)
-        anew = anew or _examined_anew(seen, judged)
+        seen, judged = _with_changed_parameters(seen, judged, earlier)
+        if seen is before:
+            seen = _examined_anew(seen, judged)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
     if judged.verdict not in ("no_gap", "insufficient_data"):
         search.progress.begin_stage("locating the gap in the model and its sensors", 3.0, 2.0)
         # without events, the smoother already ran on all fitted data
-        known = nominal.problem, nominal.unknowns, nominal.evaluation
-        smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
+        least = limits.min_log_bayes_factor
+        smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*nominal.at_estimates, least)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
     remaining, events, final, is_counted = evidence.nominal_held_out_test, seen.events, nominal, False
@@ -412,17 +360,16 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         assert isinstance(accepted[-1].refitted_model, RefittedModel)
         final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
         final, is_counted = _with_errors_of_step_and_encoders(search, final, events)
-        remaining, rest = _held_out_null_test_and_spread(final, limits)[0], ()
-        tests = _estimation_null_test(final, limits), remaining
-        if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria):
-            known = final.problem, final.unknowns, final.evaluation
-            left = smoother.smooth_unknown_forces_and_biases(*known, limits.min_log_bayes_factor)
+        fitted, remaining, _ = null_tests_of_fit(*final.at_estimates, limits.significance_level)
+        rest = ()
+        if null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria):
+            left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
-        events = _happened(seen.with_events.problem.problem_fitting_all_samples, final, limits)[0]
+        events = find_events(seen.with_events.problem_fitting_all_samples, final, limits)[0]
     search.record_stage_end_time("remaining")
     # what no effect explains
     places = [name for place in rest for name in (place.location, *place.indistinguishable_from)]
@@ -488,48 +435,3 @@ def fit_nominal_model(
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     composed = composed.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
-
-
-def _null_test(problem: EstimationProblem, residual: Array, fitted: float, limits: Thresholds) -> NullTestResult:
-    """The null test of a residual after a fit of the given number of parameters."""
-    samples = null_test.channels_with_residual_indices(problem)
-    return null_test.residual_chi2_null_test(samples, residual, fitted, limits.significance_level)
-
-
-def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
-    spread = null_test.encoder_noise_residual_covariance_factor(fit.problem, fit.unknowns)
-    residual = null_test.whiten_with_drawn_errors(fit.evaluation.residual, spread[:, :0], spread)
-    return _null_test(fit.problem, residual, effective_parameter_count(fit.problem, fit.evaluation), limits)
-
-
-def _held_out_residuals(problem: EstimationProblem, predicted: HeldOutPredictions) -> list[ResidualAndJacobian]:
-    """Whitened residual of each held-out recording. Raises `SolverError` if one could not be predicted."""
-    found = []
-    for (episode, result), whitening in zip(predicted, problem.held_out_whitening_filters, strict=True):
-        if isinstance(result, str):
-            raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
-        found.append(episode_residual_and_jacobian(episode, whitening, result))
-    return found
-
-
-def _held_out_null_test_and_spread(
-    fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS, predicted: HeldOutPredictions = ()
-) -> tuple[NullTestResult, Array]:
-    """The held-out null test, and the change (n, k) of residuals by one std of each error of shared parameters."""
-    problem, x, shared = fit.problem, fit.unknowns, len(fit.problem.shared_parameters)
-    predicted, filters = predicted or problem.predict_held_out(x, True), problem.held_out_whitening_filters
-    own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
-
-    def residual_of(moved: EstimationProblem) -> Array | None:
-        other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
-        with contextlib.suppress(SolverError):
-            return np.concatenate([part.residual for part in _held_out_residuals(other, other.predict_held_out(x))])
-        return None
-
-    found = _held_out_residuals(problem, predicted)
-    residual = np.concatenate([part.residual for part in found])
-    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
-    by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, fit.evaluation)[:shared])
-    by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
-    residual = null_test.whiten_with_drawn_errors(residual, by_parameters, by_path)
-    return _null_test(own, residual, 0, limits), by_parameters

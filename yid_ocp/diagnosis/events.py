@@ -8,6 +8,7 @@ sensor are an event of that sensor. A diagnosis removes events before its other 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,18 +27,23 @@ from yid_ocp.diagnosis.pulse_detection import (
     ForceEstimate,
     detect_force_pulses,
 )
+from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
+from yid_ocp.errors import SolverError
 from yid_ocp.files import attributes_to_dict, to_json_types
-from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
+from yid_ocp.inference import null_test
+from yid_ocp.inference.null_test import benjamini_hochberg_mask, excess_over_sample_count, times_since_recording_start
 from yid_ocp.inference.smoother import (
     SIGNIFICANT_Z,
     SmoothedUnknownsResult,
     force_log_likelihood_coefficients,
     generalised_force_unit,
+    smooth_unknown_forces_and_biases,
     smoothed_unknown_significance_mask,
 )
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns, sensor_bias_location_name
+from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.parallel.threads_and_processes import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -52,6 +58,7 @@ _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of the prediction."""
 
 _INVERSE_DYNAMICS_RTOL = 0.03  # assumed error of a good model, as a fraction of the torque
+_MIN_FORCE_EVENT_GAP_FRACTION = 0.1  # of the gap that force events must remove
 _FORCE_INTERVAL = 0.05  # interval of constant unknown force in the search for events [s]
 _MAX_SPAN_POINTS = 250  # maximum number of points of a force history processed together
 _MAX_WRONG_SAMPLES = 3  # largest number of consecutive wrong samples; more are a gap or a stuck channel
@@ -131,6 +138,49 @@ class EventSet:
 
 
 NO_EVENTS = EventSet()
+
+
+def find_events(
+    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
+) -> tuple[EventSet, SmoothedUnknownsResult | None]:
+    """Return the events in all recordings of `whole`, from the residual of a fit, and the smoother's result.
+
+    There are none if the prediction fails. Forces that remove less than a tenth of the gap are errors of the model.
+    """
+    own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.unknowns
+    guesses = fit.evaluation.equilibrium_guesses
+    pairs, parts = zip(fit.problem.episodes, own.episodes, strict=True), ("torque", "measurements")
+    has_same_data = all(getattr(a, part) is getattr(b, part) for a, b in pairs for part in parts)
+    judged = fit.problem if has_same_data else problem_with_whitening_at(own, x, guesses)
+    tested = judged.evaluate(x, False, guesses)
+    if not tested.ok:
+        return NO_EVENTS, None
+    series, level = null_test.channels_with_residual_indices(judged), limits.significance_level
+    test = null_test.residual_chi2_null_test(series, tested.residual, len(fit.values), level)
+    is_flagged = any(window.is_flagged for window in test.windows)
+    evaluation = own.evaluate(x, is_flagged, guesses)
+    if not evaluation.ok:
+        return NO_EVENTS, None
+    least = limits.min_log_bayes_factor
+    smoothed = smooth_unknown_forces_and_biases(own, x, evaluation, least) if is_flagged else None
+    found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
+    pushed, others = found.split_force_from_other_events()
+    left = 1 - _MIN_FORCE_EVENT_GAP_FRACTION
+    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > left * _excess(fit, own):
+        found = others
+    return found, smoothed
+
+
+def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
+    """Excess of the residual of a fit over noise, in all recordings; infinite if they cannot be predicted."""
+    x, guesses = problem.pack_unknowns(fit.values), fit.evaluation.equilibrium_guesses
+    judged = problem_with_whitening_at(problem, x, guesses)
+    evaluation = judged.evaluate(x, False, guesses)
+    if evaluation.ok:
+        with contextlib.suppress(SolverError):
+            held_out = [part.residual for part in judged.held_out_residuals(judged.predict_held_out(x))]
+            return excess_over_sample_count(np.concatenate([evaluation.residual[judged.residual_rows.data], *held_out]))
+    return math.inf
 
 
 def find_force_and_fault_events(

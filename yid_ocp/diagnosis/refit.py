@@ -126,6 +126,11 @@ class RefitStatistics(StoredFit):
         return RefitStatistics(**{own.name: getattr(self, own.name) for own in fields(RefitStatistics)})
 
     @property
+    def excess_chi2(self) -> float:
+        """The excess of r'r of the estimation recordings over the number of residuals, which noise alone gives."""
+        return 2 * self.cost - self.residual_count
+
+    @property
     def total_effect_parameter_count(self) -> int:
         """The number of parameters of all effects in the model together."""
         return sum(len(effect.parameters) for effect in self.effects)
@@ -158,6 +163,11 @@ class RefittedModel(RefitStatistics):
     def unknowns(self) -> Array:
         """The fitted values of the problem's unknowns, shape (nx,)."""
         return self.problem.pack_unknowns(self.values)
+
+    @property
+    def at_estimates(self) -> tuple[EstimationProblem, Array, Evaluation]:
+        """The problem, the fitted values of its unknowns, shape (nx,), and its evaluation there."""
+        return self.problem, self.unknowns, self.evaluation
 
 
 @dataclass(frozen=True)
@@ -262,7 +272,7 @@ class RefitContext:
 
 
 HeldOutPredictions = Sequence[EpisodeAndPredictionOrFailure]
-"""Predictions of all held-out recordings, with derivatives. Empty if they are not known."""
+"""Predictions of all held-out recordings, with derivatives if they are asked for."""
 EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
 """Effects to refit, and their values at the start."""
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
@@ -442,20 +452,16 @@ def refit_with_each_effect(
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
 def held_out_loss(
-    problem: EstimationProblem,
-    x: Array,
-    evaluation: Evaluation,
-    spread: Array | None = None,
-    predicted: HeldOutPredictions = (),
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, spread: Array | None = None
 ) -> HeldOutLoss:
     """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
 
-    `spread` (n, k) is from `AllCandidatesProblem`. `predicted` are predictions with derivatives, if they are known.
+    `spread` (n, k) is from `AllCandidatesProblem`.
     """
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
-    found, residuals, errors, numbered, count = predicted or problem.predict_held_out(x, True), [], [], [], 0
+    found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
     for (episode, result), whitening in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:

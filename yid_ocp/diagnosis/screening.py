@@ -22,14 +22,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
+from yid_ocp.inference.linearized_residual import (
+    orthonormal_basis_and_coefficients,
+    residual_and_jacobian_with_stated_priors,
+)
 from yid_ocp.inference.null_test import OutputResidualIndices, channels_with_residual_indices
 from yid_ocp.problem import EstimationProblem
 
@@ -125,7 +127,7 @@ def linearize_candidates(
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large
         places = [trial.unknown_names.index(name) for name in amplitudes]
-        basis, follow = _basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
+        basis, follow = orthonormal_basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         if point not in known:
@@ -146,10 +148,10 @@ def linearize_candidates(
             driven = columns[rows.data].T @ scatter
             priors = columns[rows.stated_priors] / problem.problem.options.stated_std_factor
             by_priors = priors.T @ priors
-            noise = _covariance_of_scores(columns, series) + driven @ driven.T + by_priors
+            noise = null_test.covariance_of_scores(columns, series) + driven @ driven.T + by_priors
             bias = np.zeros(columns.shape[1])
             for own, error in zip(shifted, errors, strict=True):
-                noise += _covariance_of_scores(own, series) / len(errors) ** 2
+                noise += null_test.covariance_of_scores(own, series) / len(errors) ** 2
                 bias += own[rows.data].T @ error / len(errors)
             signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
@@ -167,16 +169,6 @@ def _changes(
     return (other - data)[rows], dict(zip(names, (slopes[rows][:, at] - jacobian[rows][:, at]).T, strict=True))
 
 
-def _basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:
-    """Orthonormal basis of the columns of a matrix (n, m), and coefficients (m, k) of their fit to other columns."""
-    size = np.linalg.norm(matrix, axis=0)
-    scale = np.where(size > 0, size, 1.0)
-    u, singular, vt = np.linalg.svd(matrix / scale, full_matrices=False)
-    kept = singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)
-    basis = np.asarray(u[:, kept])
-    return basis, (vt[kept].T / singular[kept]) @ (basis.T @ columns) / scale[:, None]
-
-
 def _detectability(signature: _EffectSignature) -> CandidateDetectability:
     effect, names = signature.effect, signature.effect.amplitude_parameter_names
     information = signature.projected_sensitivity.T @ signature.projected_sensitivity
@@ -190,28 +182,6 @@ def _detectability(signature: _EffectSignature) -> CandidateDetectability:
 
 def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
-
-
-def _covariance_of_scores(columns: Array, series: Sequence[OutputResidualIndices]) -> Array:
-    """X' Omega X under the noise's known autocorrelation."""
-    total = np.zeros((columns.shape[1], columns.shape[1]))
-    for s in series:
-        x, lags = columns[s.residual_indices], s.noise_autocorrelation[: len(s.residual_indices)]
-        seen = scipy.linalg.matmul_toeplitz(np.pad(lags, (0, len(x) - len(lags))), x) if len(lags) > 1 else x
-        total += x.T @ seen
-    return (total + total.T) / 2
-
-
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[OutputResidualIndices]) -> Array:
-    """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
-    total = np.zeros((columns.shape[1], columns.shape[1]))
-    for s in series:
-        u = columns[s.residual_indices] * residual[s.residual_indices, None]
-        length = int(np.sqrt(len(u))) + 1
-        cumulative = np.cumsum(np.pad(u, ((length, length - 1), (0, 0))), axis=0)
-        sums = cumulative[length:] - cumulative[:-length]
-        total += sums.T @ sums / length
-    return total
 
 
 def _score_candidates(
@@ -252,7 +222,8 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
     room = _room(effect)
     step, decrease = _promised(x.T @ x, slope, room)
     # without the candidate's share of the residual, which would hide its significance
-    covariance = _newey_west_covariance(x, residual + x @ step, series) + signature.score_prior_covariance
+    covariance = null_test.newey_west_covariance_of_scores(x, residual + x @ step, series)
+    covariance += signature.score_prior_covariance
     # a residual below the noise must not make a score significant
     statistic = float(slope @ _pinv(max(floor, covariance, key=np.trace)) @ slope)
     p_value = null_test.chi2_p_value(statistic, len(step))

@@ -7,7 +7,7 @@ doi:10.1214/aos/1176347265).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,6 +26,9 @@ _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which
 _MIN_FURTHER_PART = 0.4  # of the gap that other effects leave, to be explained by a further one
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
+
+_Rivals = dict[str, Sequence[tuple[EffectBase, float]]]
+"""The effects that the recordings cannot distinguish from a chosen one, by its label, with their distances."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,8 @@ class SelectedEffect:
     cumulative_closure: HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
-    extended_models: tuple[RefitStatistics, ...] = ()  # `refitted_model` with one plausible effect more
+    # by effect parameter: std of what further effects, in the gap that is left, may contribute to its value
+    model_error_std: dict[str, float] = field(default_factory=dict)
 
 
 def total_gap_closure(entries: Sequence[SelectedEffect]) -> HeldOutGapClosure:
@@ -107,18 +111,14 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int = 0) 
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 
 
-def bic_difference_per_threshold(fit: RefitStatistics, other: RefitStatistics, more: int, limits: Thresholds) -> float:
-    """Compute the BIC of `fit`, which has `more` parameters beside its effects', minus that of `other`; ±1 decides."""
-    return bic_difference(fit, other, more) / _decisive_bic_difference(limits)
-
-
-def _decisive_bic_difference(limits: Thresholds) -> float:
+def decisive_bic_difference(limits: Thresholds) -> float:
+    """Return the difference of BIC from which on the recordings tell two models apart."""
     return 2 * _LOG_ODDS_FACTOR * limits.min_log_bayes_factor
 
 
-def relative_probability(bic_difference: float) -> float:
-    """Compute the probability of a model beside another one with a BIC that is larger by a relative difference."""
-    return 1.0 / (1.0 + math.exp(-_LOG_ODDS_PER_DISTANCE * bic_difference))
+def relative_probability(distance: float) -> float:
+    """Compute the probability of a model beside another one, whose BIC is larger by `distance` decisive differences."""
+    return 1.0 / (1.0 + math.exp(-_LOG_ODDS_PER_DISTANCE * distance))
 
 
 def _near_best_models(
@@ -131,13 +131,13 @@ def _near_best_models(
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
-        best = min(fits, key=lambda fit: bic_difference(fit, nominal), default=nominal)
+        ranked = sorted(fits, key=lambda fit: bic_difference(fit, nominal))
+        best = next(iter(ranked), nominal)
         # errors of the models' responses leave a part of what the best one explains; a test would find a std of chi2
         samples = best.residual_count + float(best.held_out_loss.block_sample_counts.sum())
         errors = min(_MIN_CHI2_FRACTION * bic_difference(nominal, best), math.sqrt(2 * samples))
-        decisive = max(_decisive_bic_difference(limits), errors)
-        distances = [bic_difference(fit, best) / decisive for fit in fits]
-        ranks = [(distance, 0.0) for distance in distances]
+        decisive = max(decisive_bic_difference(limits), errors)
+        distances = [bic_difference(fit, best) / decisive for fit in ranked]
     else:
         sized = [fit for fit in fits if fit.determines_size(fit.effects[-1], limits.min_z)]
         plausible = [fit for fit in sized if not fit.implausible_parameters(fit.effects[-1], limits)]
@@ -145,10 +145,9 @@ def _near_best_models(
         best_plausible = min(plausible, key=_chi2, default=nominal)
         if best_plausible.held_out_loss.excess_chi2_per_sample <= most:
             best, fits = best_plausible, plausible
-        distances = [_distance_in_prediction(fit, best) for fit in fits]
-        ranks = [(float(fit.total_effect_parameter_count), _chi2(fit)) for fit in fits]
-    near = [own for own in zip(fits, distances, ranks, strict=True) if own[1] <= 1]
-    return [(fit, distance) for fit, distance, _ in sorted(near, key=lambda own: own[2])]
+        ranked = sorted(fits, key=lambda fit: (fit.total_effect_parameter_count, _chi2(fit)))
+        distances = [_distance_in_prediction(fit, best) for fit in ranked]
+    return [(fit, distance) for fit, distance in zip(ranked, distances, strict=True) if distance <= 1]
 
 
 def _chi2(fit: RefitStatistics) -> float:
@@ -174,8 +173,8 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     """
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = chi2_per_sample_decrease_and_std_error(before, after)
-    excess = max(2 * without.cost - without.residual_count, 1.0), max(before.excess_chi2_per_sample, 1e-9)
-    part = max(2 * (without.cost - fit.cost) / excess[0], gained / excess[1])
+    part_of_fitted = 2 * (without.cost - fit.cost) / max(without.excess_chi2, 1.0)
+    part = max(part_of_fitted, gained / max(before.excess_chi2_per_sample, 1e-9))
     is_clear = gained > error and part > _MIN_FURTHER_PART * bool(without.effects)
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
@@ -207,19 +206,6 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
     return [((s.effect,), s.predicted_values) for s in (*best, *alike)]
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """The effects in the model, refitted together, and the equivalent effects of each, with their distances."""
-
-    fit: RefitStatistics
-    rivals: Mapping[str, Sequence[tuple[EffectBase, float]]] = field(default_factory=dict)  # by label
-
-    def replaced(self, fit: RefitStatistics, near: Sequence[tuple[EffectBase, float]]) -> _Choice:
-        """Return the choice of the effects in `fit`. The last gets the rivals `near`, the others keep their rivals."""
-        kept = {effect.label: self.rivals.get(effect.label, ()) for effect in fit.effects}
-        return _Choice(fit, kept | {fit.effects[-1].label: near})
-
-
 def select_effects(
     search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
@@ -229,21 +215,24 @@ def select_effects(
     estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
     effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
     """
-    limits, chosen, before = search.thresholds, _Choice(nominal), nominal
-    seen, shortlist, later = screened, _refit_shortlist(screened, limits), list[RefitStatistics]()
+    limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
+    shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
     fits = refit_with_each_effect(search, (), shortlist, nominal.values)
     if moved:
-        dearest_first = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
-        fits = list({fit.effects[-1].label: fit for fit in dearest_first}.values())
-    near = _near_best_models(nominal, fits, limits)
-    first = sorted(fits, key=lambda fit: (fit is not near[0][0], _chi2(fit)))
-    while better := next((fit for fit, _ in near if _is_needed(chosen.fit, fit, limits)), None):
+        fits = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
+    single = {fit.effects[0].label: fit for fit in fits}  # of two fits the one that costs less, which is the last
+    near = _near_best_models(nominal, list(single.values()), limits)
+    best = next((fit.effects[0].label for fit, _ in near), "")
+    while better := next((fit for fit, _ in near if _is_needed(chosen, fit, limits)), None):
         # untried confusable candidates cannot be excluded yet
-        alike = seen.confusability.candidates_confusable_with(better.effects[-1].label, limits.signature_overlap)
+        label = better.effects[-1].label
+        alike = seen.confusability.candidates_confusable_with(label, limits.signature_overlap)
         untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
-        rivals = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.fit.effects]
-        before, chosen = chosen.fit, chosen.replaced(better, [*rivals, *untried])
-        base, beside = better.effects, join_effect_labels(better.effects)
+        tried = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.effects]
+        rivals[label] = [*tried, *untried]
+        before, chosen = chosen, better
+        base = better.effects
+        beside = join_effect_labels(base)
         closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
@@ -254,7 +243,7 @@ def select_effects(
         seen = search.screen(base, better.values, f"beside {beside}")
         # what the effects close together with what another one promises in the linear model
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
-        if promised < limits.min_explained_fraction * max(2 * nominal.cost - nominal.residual_count, 1.0):
+        if promised < limits.min_explained_fraction * max(nominal.excess_chi2, 1.0):
             break
         fits = refit_with_each_effect(search, base, _refit_shortlist(seen, limits), better.values)
         if len(base) == 1:
@@ -262,11 +251,19 @@ def select_effects(
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         later += [fit.statistics() for fit in fits]
         near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
-    chosen = _reconsidered(search, nominal, chosen, before)
-    if len(chosen.fit.effects) == 1:
-        # its last fit may differ from its first one
-        first = [chosen.fit, *(fit for fit in first if fit.effects != chosen.fit.effects)]
-    return tuple(first), _with_closures(search, nominal, chosen, first, later)
+    chosen = _reconsidered(search, nominal, chosen, before, rivals)
+    if len(chosen.effects) == 1:
+        best = chosen.effects[0].label
+        single[best] = chosen  # it may differ from the first fit
+    known = {join_effect_labels(fit.effects): fit for fit in (*single.values(), chosen)}
+    added = []
+    for i, effect in enumerate(chosen.effects, 1):
+        name = join_effect_labels(chosen.effects[:i])
+        fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
+        closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
+        same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
+        added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
+    return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)
 
 
 def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
@@ -293,30 +290,37 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
     return chosen[: limits.n_refit_pairs]
 
 
-def _reconsidered(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, before: RefitStatistics) -> _Choice:
-    """Try each effect's position again with all others present: without it, and with other effects instead."""
-    tried = {frozenset(effect.label for effect in before.effects)}
-    while len(chosen.fit.effects) > 1:
-        labels = frozenset(effect.label for effect in chosen.fit.effects)
-        own = next((effect for effect in chosen.fit.effects if labels - {effect.label} not in tried), None)
-        if own is None or search.is_skipped_past_deadline("whether every effect is needed"):
+def _reconsidered(
+    search: RefitContext, nominal: RefitStatistics, fit: RefitStatistics, before: RefitStatistics, rivals: _Rivals
+) -> RefitStatistics:
+    """Try each effect's position again with all others present: without it, and with other effects instead.
+
+    The position beside the effects of `before`, the fit without the last addition, has just been tried.
+    """
+    tried = {frozenset[str](), frozenset(effect.label for effect in before.effects)}
+    labels = frozenset(effect.label for effect in fit.effects)
+    while own := next((effect for effect in fit.effects if labels - {effect.label} not in tried), None):
+        if search.is_skipped_past_deadline("whether every effect is needed"):
             break
         tried.add(labels - {own.label})
-        chosen = _revised(search, nominal, chosen, own)
-    return chosen
+        fit = _revised(search, nominal, fit, own, rivals)
+        labels = frozenset(effect.label for effect in fit.effects)
+    return fit
 
 
-def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, effect: EffectBase) -> _Choice:
-    """The choice without one effect, or with it or another effect last, and the equivalent effects there."""
-    limits, full, label = search.thresholds, chosen.fit, effect.label
+def _revised(
+    search: RefitContext, nominal: RefitStatistics, full: RefitStatistics, effect: EffectBase, rivals: _Rivals
+) -> RefitStatistics:
+    """The fit without one effect of `full`, or with it or another effect last, whose `rivals` are then replaced."""
+    limits, label = search.thresholds, effect.label
     rest = tuple(other for other in full.effects if other is not effect)
     # it starts elsewhere than a refit of the same effects in an earlier round
     without = search.refit(rest, full.values, f"{join_effect_labels(full.effects)} without {label}")
     if without is None:
-        return chosen
+        return full
     if not _is_needed(without, full, limits):
         search.progress.begin_stage(f"removed {label}, because the other effects explain as much without it")
-        return replace(chosen, fit=without)
+        return without
     now = f"{full.held_out_loss.chi2_per_sample:.4g}"
     search.progress.begin_stage(f"trying other effects in place of {label} (held-out chi2/n with it: {now})", 3.0, 13.0)
     company = f"in place of {label}"
@@ -327,33 +331,11 @@ def _revised(search: RefitContext, nominal: RefitStatistics, chosen: _Choice, ef
     others = refit_with_each_effect(search, rest, tried, without.values, company)
     near = _near_best_models(nominal, [own, *_plausible_beside(rest, others, limits)], limits)
     better = next((fit for fit, _ in near if _is_needed(without, fit, limits)), own)
-    found = chosen.replaced(better, [(fit.effects[-1], distance) for fit, distance in near])
+    rivals[better.effects[-1].label] = [(fit.effects[-1], distance) for fit, distance in near]
     if better is own:
-        return replace(found, fit=full)
+        return full
     search.progress.begin_stage(f"replaced {label} by {better.effects[-1].label}")
-    return found
-
-
-def _with_closures(
-    search: RefitContext,
-    nominal: RefitStatistics,
-    chosen: _Choice,
-    first: Sequence[RefitStatistics],
-    later: Sequence[RefitStatistics],
-) -> tuple[SelectedEffect, ...]:
-    """The selected effects in order, each with the fit of all effects up to it (or of all, if that fit fails)."""
-    effects, found = chosen.fit.effects, []
-    for i, effect in enumerate(effects, 1):
-        known = next((fit for fit in (chosen.fit, *first) if fit.effects == effects[:i]), None)
-        again = f"{join_effect_labels(effects[:i])} again"
-        fit = known or search.refit(effects[:i], chosen.fit.values, again) or chosen.fit
-        closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        # one effect more, and no other one less
-        more = [o for o in later if len(_beside(fit.effects, o)) == 1 == len(o.effects) - len(fit.effects)]
-        more = _plausible_beside(fit.effects, more, search.thresholds)
-        same = _equivalents_and_shares(effect, chosen.rivals[effect.label])
-        found.append(SelectedEffect(effect, fit, closed, *same, tuple(more)))
-    return tuple(found)
+    return better
 
 
 def _equivalents_and_shares(
@@ -369,15 +351,16 @@ def _equivalents_and_shares(
     return tuple(effects[i] for i in kept), tuple(shares[kept].tolist())
 
 
-def widen_refit_stds_by_model_error(entry: SelectedEffect, limits: Thresholds) -> RefitStatistics:
-    """Return the refit of `entry`, with stds of at least the rms change of a value by one effect more.
+def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:
+    """Root mean square change of each effect parameter of a fit by one plausible effect more; empty if none can act.
 
-    This holds if the refit leaves a gap, in which any further effect may have a part.
+    Any further effect may have a part in the gap that the fit leaves. If it leaves only noise, there is none.
     """
-    fit, count = entry.refitted_model, max(len(entry.extended_models), 1)
     if _leaves_noise(fit, limits):
-        return fit
-    names = [name for effect in fit.effects for name in effect.parameters.names]
-    moved = {name: [other.values[name] - fit.values[name] for other in entry.extended_models] for name in names}
-    std = {name: max(fit.std[name], math.hypot(*own) / math.sqrt(count)) for name, own in moved.items()}
-    return replace(fit, std={**fit.std, **std})
+        return {}
+    # one effect more, and no other one less
+    more = [o for o in later if len(_beside(fit.effects, o)) == 1 == len(o.effects) - len(fit.effects)]
+    more = _plausible_beside(fit.effects, more, limits)
+    names, count = [name for effect in fit.effects for name in effect.parameters.names], max(len(more), 1)
+    moved = {name: [other.values[name] - fit.values[name] for other in more] for name in names}
+    return {name: math.hypot(*changes) / math.sqrt(count) for name, changes in moved.items()}

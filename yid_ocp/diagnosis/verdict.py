@@ -111,9 +111,9 @@ class Judgement:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
 
-    def with_confusable_parameter_changes(self, names: Sequence[str], bic_difference: float) -> Judgement:
-        """Return this judgement if changes explain as much (BIC difference: `select.bic_difference_per_threshold`)."""
-        rivals, probability = tuple(names), self.probability * select.relative_probability(bic_difference)
+    def with_confusable_parameter_changes(self, names: Sequence[str], distance: float) -> Judgement:
+        """Return this judgement if changes explain as much, at a distance as in `select.relative_probability`."""
+        rivals, probability = tuple(names), self.probability * select.relative_probability(distance)
         return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
@@ -160,25 +160,6 @@ class Judgement:
         return fitted, held_out
 
 
-def _verdict(said: Judgement, exceeds: bool, suffice: bool, limits: Thresholds) -> tuple[str, _UnknownVerdictReason]:
-    """The verdict, and the first reason why no effect is accepted. See `explained_and_required_fractions`.
-
-    A gap that is seen only along a candidate's signature counts only with an accepted effect.
-    """
-    fractions = said.explained_and_required_fractions(limits)
-    reasons: dict[_UnknownVerdictReason, bool] = {
-        "none": not said.selected_effects,
-        "little": not any(part >= least for part, least in fractions),
-        "stand_in": bool(said.undetermined_sizes(limits)),
-    }
-    reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
-    if not suffice:
-        return "insufficient_data", ""
-    if reason:
-        return ("unknown", reason) if exceeds else ("no_gap", "")
-    return ("confusable" if len(said.selected_effects[0].equivalent_effects) > 1 else "effect"), ""
-
-
 def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     """Search for effects if there is evidence for a gap, and decide the verdict.
 
@@ -192,29 +173,47 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
 
     carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
     if added:
-        last = added[-1].refitted_model
+        last, beside = added[-1].refitted_model, added[-1].model_error_std
         explained = _explained_fraction(nominal, last, limits)
         carried = _check_effect_amplitude_transfer(search, last)
-        last = select.widen_refit_stds_by_model_error(added[-1], limits)
-        least = {own.parameter: own.significant_disagreement_as_std for own in carried}
-        last = replace(last, std={name: max(std, least.get(name, 0.0)) for name, std in last.std.items()})
-        added = (*added[:-1], replace(added[-1], refitted_model=last))
+        apart = {own.parameter: own.significant_disagreement_as_std for own in carried}
+        std = {name: max(std, beside.get(name, 0.0), apart.get(name, 0.0)) for name, std in last.std.items()}
+        added = (*added[:-1], replace(added[-1], refitted_model=replace(last, std=std)))
     said = Judgement("", "", fits, added, explained, carried, 0.0, ())
-    verdict, reason = _verdict(said, evidence.residual_exceeds_noise(limits), evidence.are_data_sufficient, limits)
+    reasons = _reasons_against(said, limits)
+    reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
+    # a gap that is seen only along a candidate's signature counts only with an accepted effect
+    verdicts = {
+        "insufficient_data": not evidence.are_data_sufficient,
+        "unknown": bool(reason) and evidence.residual_exceeds_noise(limits),
+        "no_gap": bool(reason),
+        "confusable": any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]),
+        "effect": True,
+    }
+    verdict = next(name for name, holds in verdicts.items() if holds)
     search.record_stage_end_time("transfer")
-    return replace(said, verdict=verdict, unknown_reason=reason, probability=_probability(said, limits))
+    probability = 0.0 if reasons["none"] else _probability(said, reasons["stand_in"], limits)
+    told = reason if verdict == "unknown" else ""
+    return replace(said, verdict=verdict, unknown_reason=told, probability=probability)
 
 
-def _probability(said: Judgement, limits: Thresholds) -> float:
+def _reasons_against(said: Judgement, limits: Thresholds) -> dict[_UnknownVerdictReason, bool]:
+    """Whether each reason not to accept the selected effects holds; the first that does is told."""
+    return {
+        "none": not said.selected_effects,
+        "little": not any(part >= least for part, least in said.explained_and_required_fractions(limits)),
+        "stand_in": bool(said.undetermined_sizes(limits)),
+    }
+
+
+def _probability(said: Judgement, is_size_unknown: bool, limits: Thresholds) -> float:
     """Probability that the selected effects are the cause, from how much they explain of what is required.
 
     A logistic curve fitted to a calibration ensemble; see `docs/design/verdicts.md`.
     """
-    if not said.selected_effects:
-        return 0.0
     (fitted, least), (closed, goal) = said.explained_and_required_fractions(limits)
     left = min(1.0 - fitted, (1.0 - closed) * (1.0 - least) / (1.0 - goal))  # the first if there is no closure
-    unexplained = 1.0 if said.undetermined_sizes(limits) else max(left, _MIN_UNEXPLAINED)
+    unexplained = 1.0 if is_size_unknown else max(left, _MIN_UNEXPLAINED)
     return 1.0 / (1.0 + math.exp(-_LOGISTIC_OFFSET - _LOGISTIC_SLOPE * math.log((1.0 - least) / unexplained)))
 
 
@@ -225,7 +224,7 @@ def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits:
     """
     before, left = nominal.held_out_loss, last.held_out_loss.excess_chi2_per_sample
     decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
-    excess = max(2 * nominal.cost - nominal.residual_count, decrease, 1.0)
+    excess = max(nominal.excess_chi2, decrease, 1.0)
     least = max(before.excess_chi2_per_sample * 2 / 3, math.sqrt(2.0 / float(before.block_sample_counts.sum())))
     fits_to_noise = 2 * last.cost < (1 + limits.min_excess_chi2_per_dof) * last.residual_count
     return 1.0 if fits_to_noise and left < min(least, limits.min_excess_chi2_per_dof) else decrease / excess

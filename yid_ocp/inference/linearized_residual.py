@@ -154,6 +154,19 @@ def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluat
     return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
 
 
+def orthonormal_basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:
+    """Return an orthonormal basis of the columns of `matrix` (n, m), and coefficients (m, k) of their fit to `columns`.
+
+    Directions with less than 1e-7 of the largest singular value, of columns of unit length, are left out.
+    """
+    size = np.linalg.norm(matrix, axis=0)
+    scale = np.where(size > 0, size, 1.0)
+    u, singular, vt = np.linalg.svd(matrix / scale, full_matrices=False)
+    kept = singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)
+    basis = np.asarray(u[:, kept])
+    return basis, (vt[kept].T / singular[kept]) @ (basis.T @ columns) / scale[:, None]
+
+
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Return d in [lower, upper] that minimises |J d + r|^2 + mu c |d|^2; c is the largest squared column norm of J."""
     count = jacobian.shape[1]

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
@@ -123,6 +124,11 @@ def residual_chi2_null_test(
         parts = [residual[s.residual_indices] for s in series if s.channel == channel]
         channels[channel] = float(np.mean(np.concatenate(parts) ** 2))
     return NullTestResult(ratio, effective, p_value, channels, _windows(series, residual, level, window))
+
+
+def excess_over_sample_count(residual: Array) -> float:
+    """Return r'r of a whitened residual (n,) minus the number of used samples, which noise alone gives."""
+    return float(residual @ residual) - np.count_nonzero(residual)
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
@@ -264,6 +270,28 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputRe
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
                     series.append(OutputResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
+
+
+def covariance_of_scores(columns: Array, series: Sequence[OutputResidualIndices]) -> Array:
+    """Compute the covariance X' Omega X (p, p) of X'r, X (nr, p), under the noise's known autocorrelation."""
+    total = np.zeros((columns.shape[1], columns.shape[1]))
+    for s in series:
+        x, lags = columns[s.residual_indices], s.noise_autocorrelation[: len(s.residual_indices)]
+        seen = scipy.linalg.matmul_toeplitz(np.pad(lags, (0, len(x) - len(lags))), x) if len(lags) > 1 else x
+        total += x.T @ seen
+    return (total + total.T) / 2
+
+
+def newey_west_covariance_of_scores(columns: Array, residual: Array, series: Sequence[OutputResidualIndices]) -> Array:
+    """Compute the covariance (p, p) of X'r for a residual of unknown autocorrelation (Newey and West 1987)."""
+    total = np.zeros((columns.shape[1], columns.shape[1]))
+    for s in series:
+        u = columns[s.residual_indices] * residual[s.residual_indices, None]
+        length = int(np.sqrt(len(u))) + 1
+        cumulative = np.cumsum(np.pad(u, ((length, length - 1), (0, 0))), axis=0)
+        sums = cumulative[length:] - cumulative[:-length]
+        total += sums.T @ sums / length
+    return total
 
 
 def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ import scipy.special
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
 from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -113,6 +115,41 @@ def assess_goodness_of_fit(
     found = null_test.residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
     explains = not null_test.residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_data_issue_above_warning)
+
+
+def null_tests_of_fit(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, level: float
+) -> tuple[null_test.NullTestResult, null_test.NullTestResult, Array]:
+    """Test whether the residuals of a fit at `x` are only noise: of the estimation and of the held-out recordings.
+
+    Noise of encoders that move the model counts as noise, on held-out recordings also errors of the fitted parameters.
+    The array (n, k) is the change of held-out residuals by one std of each error of shared parameters. Raises
+    `SolverError` if a held-out recording cannot be predicted.
+    """
+    shared, filters = len(problem.shared_parameters), problem.held_out_whitening_filters
+    predicted = problem.predict_held_out(x, True)
+    own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
+
+    def residual_of(moved: EstimationProblem) -> Array | None:
+        other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
+        with contextlib.suppress(SolverError):
+            return np.concatenate([part.residual for part in other.held_out_residuals(other.predict_held_out(x))])
+        return None
+
+    found = problem.held_out_residuals(predicted)
+    residual = np.concatenate([part.residual for part in found])
+    slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
+    by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, evaluation)[:shared])
+    by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
+    residual = null_test.whiten_with_drawn_errors(residual, by_parameters, by_path)
+    fitted_by_path = null_test.encoder_noise_residual_covariance_factor(problem, x)
+    fitted = null_test.whiten_with_drawn_errors(evaluation.residual, fitted_by_path[:, :0], fitted_by_path)
+    count = effective_parameter_count(problem, evaluation)
+    before, held_out = (
+        null_test.residual_chi2_null_test(null_test.channels_with_residual_indices(of), r, parameters, level)
+        for of, r, parameters in ((problem, fitted, count), (own, residual, 0))
+    )
+    return before, held_out, by_parameters
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprTexts, abbreviated_names_text, count_with_noun
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import ConfigError, DataError, failed_rollout_error
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.problem.episode_prediction import EpisodePredictor, episode_with_equilibrium_guess
@@ -44,7 +44,7 @@ from yid_ocp.problem.evaluation import (
     stated_prior_stds_of_unknowns,
     stated_rms_noise_of_data_residuals,
 )
-from yid_ocp.problem.measurements import huber_loss_and_sqrt_weights
+from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_sqrt_weights
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
@@ -296,6 +296,15 @@ class EstimationProblem(ReprMixin):
         """
         predict = self.predictor.predict_episode
         return [(asked[0], predict(*asked, derivatives)) for asked in held_out_prediction_arguments(self, x)]
+
+    def held_out_residuals(self, predicted: Sequence[EpisodeAndPredictionOrFailure]) -> list[ResidualAndJacobian]:
+        """Whiten the residual of each held-out recording, as predicted. Raises `SolverError` if a prediction failed."""
+        found = []
+        for (episode, result), whitening in zip(predicted, self.held_out_whitening_filters, strict=True):
+            if isinstance(result, str):
+                raise failed_rollout_error(result, f"held-out recording '{episode.name}'")
+            found.append(episode_residual_and_jacobian(episode, whitening, result))
+        return found
 
     def simulate_synthetic_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
