@@ -32,7 +32,11 @@ from yid_ocp.diagnosis.refit import (
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, screen_candidates
+from yid_ocp.diagnosis.screening import (
+    EMPTY_SCREENING_RESULT,
+    changes_by_candidates_at_same_locations,
+    screen_candidates,
+)
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
@@ -353,6 +357,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
     remaining, events, final, is_counted = evidence.nominal_held_out_test, seen.events, nominal, False
+    forecast = dict[str, float]()
     if judged.verdict == "no_gap":
         final, is_counted = _with_errors_of_step_and_encoders(search, nominal, events)
         evidence = replace(evidence, nominal_model=final)
@@ -365,6 +370,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         if null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria):
             left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
+            screened = search.screen(final.effects, final.values, "what the effects leave")
+            forecast = changes_by_candidates_at_same_locations(screened, final.effects, limits.significance_level)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
@@ -376,9 +383,10 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     prior = nominal.problem.options.multivariate_prior
     law = find_gap_law(search, problem.with_replaced_multivariate_prior(prior), final, places, seen.events)
     if accepted:
-        # an estimate is no surer than the law of what is left moves it
+        # an estimate is no surer than the law of what is left, or another effect at its location, moves it
         beside = final.values if law is None else law.model.values
-        final = replace(final, std={k: max(std, abs(beside[k] - final.values[k])) for k, std in final.std.items()})
+        moved = {name: max(abs(beside[name] - final.values[name]), abs(forecast.get(name, 0.0))) for name in final.std}
+        final = replace(final, std={name: max(std, moved[name]) for name, std in final.std.items()})
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")
     ends = search.stage_ends

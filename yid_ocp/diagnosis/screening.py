@@ -50,6 +50,7 @@ class _EffectSignature:
     score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own autocorrelation
     score_prior_covariance: Array  # shape (p, p): the part of it that stated priors make
     score_bias: Array  # E[X'r] - E[X]'E[r], shape (p,): encoder noise moves both X and r
+    base_changes: Array  # of the parameters of the model's effects by the amplitudes, shape (nb, p)
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ class ScoreTestResult:
     predicted_chi2_decrease: float
     lm_statistic: float  # LM with robust covariance
     p_value: float
+    base_changes: tuple[float, ...] = ()  # of the parameters of the model's effects by the step, in order
 
 
 def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[str, float]]:
@@ -143,8 +145,10 @@ def linearize_candidates(
             shift[rows.data] = change[:, places] - np.delete(change, places, axis=1) @ follow
             shifts.append(shift - basis @ (basis.T @ shift))
             errors.append(error)
-        parts = zip(*(np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, *shifts)), strict=True)
-        for (effect, shape), (columns, *shifted) in zip(chosen, parts, strict=True):
+        others = [name for name in trial.unknown_names if name not in amplitudes]
+        by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
+        split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_base, *shifts))
+        for (effect, shape), (columns, changes, *shifted) in zip(chosen, zip(*split, strict=True), strict=True):
             driven = columns[rows.data].T @ scatter
             priors = columns[rows.stated_priors] / problem.problem.options.stated_std_factor
             by_priors = priors.T @ priors
@@ -153,7 +157,7 @@ def linearize_candidates(
             for own, error in zip(shifted, errors, strict=True):
                 noise += null_test.covariance_of_scores(own, series) / len(errors) ** 2
                 bias += own[rows.data].T @ error / len(errors)
-            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias))
+            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias, changes))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
 
 
@@ -230,7 +234,8 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
     values = _values(effect, step) | signature.shape_values
-    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value)
+    changes = tuple((signature.base_changes @ step).tolist())
+    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, changes)
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
@@ -349,3 +354,20 @@ def screen_candidates(
     ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
     everything = _make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)
+
+
+def changes_by_candidates_at_same_locations(
+    screened: ScreeningResult, base: Sequence[EffectBase], level: float
+) -> dict[str, float]:
+    """Forecast how the parameters of each effect in `base` change if a candidate at its location is added.
+
+    It is the candidate with the largest predicted decrease of r'r whose p-value is below `level`. Effects without one
+    are left out.
+    """
+    names, found = [name for effect in base for name in effect.parameters.names], dict[str, float]()
+    for effect in base:
+        alike = (s for s in screened.candidate_scores if s.effect.location == effect.location and s.p_value < level)
+        if best := next(alike, None):
+            changes = dict(zip(names, best.base_changes, strict=True))
+            found |= {name: changes[name] for name in effect.parameters.names}
+    return found

@@ -52,7 +52,6 @@ _MAX_GROUPS = 4  # selected at most
 _MAX_STD_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
-_INTERVALS_PER_PRODUCT = 8  # whose responses are multiplied at once
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
 
@@ -293,41 +292,31 @@ def _selected(
     return variance, state.log_evidence
 
 
-def _responses(base: _Filtered, chosen: IntArray, correlation: float) -> Array:
-    """Innovations caused by disturbances of unit variance of the u chosen unknowns, (rows of all intervals, J u)."""
+def _response_products(base: _Filtered, chosen: IntArray, correlation: float) -> tuple[Array, Array]:
+    """Products W'W (J u, J u) and W'V (J u, 1 + ntheta), where V are the filter's innovations.
+
+    W are innovations caused by disturbances of unit variance of the u `chosen` unknowns in each of the J intervals.
+    """
     model, updates = base.model, base.updates
-    ns, count, u, first = len(model.initial_state_std), len(updates), len(chosen), 0
+    ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
     # state error that the filter has not yet followed, by the interval of the disturbance, and the disturbed unknown
     behind, unknown = np.zeros((updates[0].covariance.shape[1], count * u)), np.zeros((count, 1))
     if correlation:  # the first disturbance acted before the start
         behind[:ns, :u] = model.initial_state_jacobian[:, chosen]
-    found = np.zeros((sum(len(update.white) for update in updates), count * u))
-    for k, (interval, (step, *_)) in enumerate(zip(model.intervals, updates, strict=True)):
+    information, pull = np.zeros((count * u, count * u)), np.zeros((count * u, len(base.products)))
+    for k, (interval, (step, _, _, white)) in enumerate(zip(model.intervals, updates, strict=True)):
         unknown[:k] *= correlation
         unknown[k] = math.sqrt(1 - correlation**2) if k else 1.0
-        begun, left = unknown[: k + 1], behind[:, : (k + 1) * u]
-        rows, first = found[first : first + len(step.whitening), : left.shape[1]], first + len(step.whitening)
-        shaped, closed = step.closed_loop
+        # later disturbances do not act yet
+        begun, known = unknown[: k + 1], (k + 1) * u
+        left, (shaped, closed) = behind[:, :known], step.closed_loop
         seen = step.whitening @ interval.unknown_jacobian[:, chosen]
         pushed = -step.transition.propagate_state(step.projected_covariance.T @ seen)
         pushed[:ns] += interval.unknown_input_matrix[:, chosen]
-        rows[:] = shaped @ left + (seen[:, None] * begun).reshape(rows.shape)
+        rows = shaped @ left + (seen[:, None] * begun).reshape(len(seen), known)
         left[:] = closed @ left + (pushed[:, None] * begun).reshape(left.shape)
-    return found
-
-
-def _products(responses: Array, base: _Filtered, unknowns: int) -> tuple[Array, Array]:
-    """Products of `_responses` with themselves (J u, J u) and with the innovations (J u, 1 + ntheta)."""
-    size, first = responses.shape[1], 0
-    information, pull = np.zeros((size, size)), np.zeros((size, len(base.products)))
-    white = np.vstack([update.white for update in base.updates])
-    ends = np.cumsum([len(update.white) for update in base.updates])
-    for last in [*range(_INTERVALS_PER_PRODUCT, len(ends), _INTERVALS_PER_PRODUCT), len(ends)]:
-        # disturbances do not affect the innovations of earlier intervals
-        span, known, first = slice(first, ends[last - 1]), last * unknowns, ends[last - 1]
-        rows = responses[span, :known]
         information[:known, :known] += rows.T @ rows
-        pull[:known] += rows.T @ white[span]
+        pull[:known] += rows.T @ white
     return information, pull
 
 
@@ -342,7 +331,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) 
     parts = []
     for base in bases:
         chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
-        parts.append(_products(_responses(base, chosen, base.model.interval_correlation), base, len(chosen)))
+        parts.append(_response_products(base, chosen, base.model.interval_correlation))
 
     def cost(exponent: float) -> float:
         variance, left, determinant = 10.0**exponent, products, log_determinant
@@ -418,11 +407,11 @@ def force_log_likelihood_coefficients(
     if not done.updates:
         return []
     free, found, u = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0, [], len(unknowns)
-    responses = _responses(done, np.array(unknowns, int), 0.0)
-    products = responses.T @ np.vstack([update.white for update in done.updates])
-    for rows, told in ((responses[:, i::u], products[i::u]) for i in range(u)):
-        weighed = np.linalg.solve(free, np.column_stack([done.products[1:, 0], told[:, 1:].T]))
-        found.append((told[:, 0] - told[:, 1:] @ weighed[:, 0], rows.T @ rows - told[:, 1:] @ weighed[:, 1:]))
+    products, pull = _response_products(done, np.array(unknowns, int), 0.0)
+    for i in range(u):
+        own = pull[i::u]
+        weighed = np.linalg.solve(free, np.column_stack([done.products[1:, 0], own[:, 1:].T]))
+        found.append((own[:, 0] - own[:, 1:] @ weighed[:, 0], products[i::u, i::u] - own[:, 1:] @ weighed[:, 1:]))
     return found
 
 
