@@ -76,7 +76,8 @@ def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) 
     columns = columns[:, None] if columns.ndim == 1 else columns
     noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
     named = {f"{of.label}.{name}": value for name, value in shapes.items()}
-    return _EffectSignature(of, named, columns, noise, priors * np.ones_like(noise), np.zeros(len(noise)))
+    made = (columns, noise, priors * np.ones_like(noise), np.zeros(len(noise)), np.zeros((0, columns.shape[1])))
+    return _EffectSignature(of, named, *made)
 
 
 def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLinearization:

@@ -14,7 +14,12 @@ from made_series import series
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import ProjectedCandidatesLinearization, linearize_candidates, screen_candidates
+from yid_ocp.diagnosis.screening import (
+    ProjectedCandidatesLinearization,
+    changes_by_candidates_at_same_locations,
+    linearize_candidates,
+    screen_candidates,
+)
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
 
@@ -65,6 +70,17 @@ def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_doe
         assert 2 * (nominal.cost - fit.cost) == pytest.approx(
             by_label[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3
         )
+
+
+def test_an_effect_changes_as_forecast_if_the_best_candidate_at_its_location_is_added(screened):
+    composed, nominal, _ = screened
+    known = {effect.label: effect for effect in composed.candidate_effects}
+    base = tuple(known[label] for label in ("effort_offset@elbow", "effort_offset@shoulder"))
+    fit = refit_with_effects(composed, base, nominal.values)
+    more = refit_with_effects(composed, (*base, known["joint_coulomb@elbow"]), fit.values)
+    forecast = changes_by_candidates_at_same_locations(screen_candidates(composed, base, fit.values), base, 1e-6)
+    name = "effort_offset@elbow.offset"
+    assert forecast == {name: pytest.approx(more.values[name] - fit.values[name], rel=0.05)}
 
 
 def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_the_rest(screened):

@@ -32,11 +32,7 @@ from yid_ocp.diagnosis.refit import (
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import (
-    EMPTY_SCREENING_RESULT,
-    changes_by_candidates_at_same_locations,
-    screen_candidates,
-)
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candidates_at_same_locations, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
