@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_ef
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import (
     ProjectedCandidatesLinearization,
-    changes_by_candidates_at_same_locations,
+    changes_by_candidates_at_location,
     linearize_candidates,
     screen_candidates,
 )
@@ -78,7 +78,7 @@ def test_an_effect_changes_as_forecast_if_the_best_candidate_at_its_location_is_
     base = tuple(known[label] for label in ("effort_offset@elbow", "effort_offset@shoulder"))
     fit = refit_with_effects(composed, base, nominal.values)
     more = refit_with_effects(composed, (*base, known["joint_coulomb@elbow"]), fit.values)
-    forecast = changes_by_candidates_at_same_locations(screen_candidates(composed, base, fit.values), base, 1e-6)
+    forecast = changes_by_candidates_at_location(screen_candidates(composed, base, fit.values), base, 1e-6)
     name = "effort_offset@elbow.offset"
     assert forecast == {name: pytest.approx(more.values[name] - fit.values[name], rel=0.05)}
 

@@ -32,7 +32,7 @@ from yid_ocp.diagnosis.refit import (
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
-from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candidates_at_same_locations, screen_candidates
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candidates_at_location, screen_candidates
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
@@ -367,7 +367,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
             left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
             screened = search.screen(final.effects, final.values, "what the effects leave")
-            forecast = changes_by_candidates_at_same_locations(screened, final.effects, limits.significance_level)
+            forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)

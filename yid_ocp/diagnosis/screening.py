@@ -356,7 +356,7 @@ def screen_candidates(
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)
 
 
-def changes_by_candidates_at_same_locations(
+def changes_by_candidates_at_location(
     screened: ScreeningResult, base: Sequence[EffectBase], level: float
 ) -> dict[str, float]:
     """Forecast how the parameters of each effect in `base` change if a candidate at its location is added.
