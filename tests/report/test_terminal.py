@@ -85,7 +85,7 @@ def test_a_solve_says_what_is_not_found():
     assert lines[0].startswith("Use these values within their ±: p_identifiable. 1 of 4 free")
     size, text = "chi2 per degree of freedom is 1.03; noise alone gives 1", " ".join(lines)
     assert "These recordings do not determine the following parameters: p_not_identifiable." in text
-    assert "These parameters are only weakly determined, so use the 95 % interval: p_weak." in lines
+    assert "These parameters are only weakly determined: p_weak. Their 95 % intervals are rough" in text
     assert f"The model explains the recordings to within their noise ({size})." in text
     assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))

@@ -345,6 +345,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
             seen = _examined_anew(seen, judged)
     smoothed: SmoothedUnknownsResult | None = None
     located = where = rest = tuple[GapLocation, ...]()
+    screened = EMPTY_SCREENING_RESULT
     if judged.verdict not in ("no_gap", "insufficient_data"):
         search.progress.begin_stage("locating the gap in the model and its sensors", 3.0, 2.0)
         # without events, the smoother already ran on all fitted data
@@ -353,7 +354,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
     remaining, events, final, is_counted = evidence.nominal_held_out_test, seen.events, nominal, False
-    forecast = dict[str, float]()
     if judged.verdict == "no_gap":
         final, is_counted = _with_errors_of_step_and_encoders(search, nominal, events)
         evidence = replace(evidence, nominal_model=final)
@@ -367,7 +367,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
             left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
             screened = search.screen(final.effects, final.values, "what the effects leave")
-            forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
         flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
         closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
@@ -379,10 +378,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     prior = nominal.problem.options.multivariate_prior
     law = find_gap_law(search, problem.with_replaced_multivariate_prior(prior), final, places, seen.events)
     if accepted:
-        # an estimate is no surer than the law of what is left, or another effect at its location, moves it
-        beside = final.values if law is None else law.model.values
-        moved = {name: max(abs(beside[name] - final.values[name]), abs(forecast.get(name, 0.0))) for name in final.std}
-        final = replace(final, std={name: max(std, moved[name]) for name, std in final.std.items()})
+        forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
+        final = _no_surer_than_changes(final, final.values if law is None else law.model.values, forecast)
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")
     ends = search.stage_ends
@@ -412,6 +409,14 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))
     return replace(finding, summary=diagnosis_summary_text(finding))
+
+
+def _no_surer_than_changes(
+    fit: RefittedModel, beside_law: Mapping[str, float], forecast: Mapping[str, float]
+) -> RefittedModel:
+    """The fit with stds of at least the changes of values by a law of what is left, or as forecast for an effect."""
+    changes = {name: max(abs(beside_law[name] - fit.values[name]), abs(forecast.get(name, 0.0))) for name in fit.std}
+    return replace(fit, std={name: max(std, changes[name]) for name, std in fit.std.items()})
 
 
 def _fitted_nominal_model(

@@ -1,4 +1,4 @@
-"""Summaries of a diagnosis, of a blind test, of a batch, and of comparisons of methods or runs."""
+"""Summaries of a diagnosis, a blind test, a batch and an export, and of comparisons of methods or runs."""
 
 from __future__ import annotations
 
@@ -444,3 +444,39 @@ def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
     if entry is not None and entry["free"]:
         return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])
     return "" if entry is None else f"{entry['value']:.4g} (fixed)"
+
+
+@register_summary("yid-export/1")
+def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
+    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
+    listed = {
+        name: entry
+        for name, entry in manifest["parameters"].items()
+        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
+    }
+    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
+    entries = (manifest["effects"] | grasps | listed).items()
+    rows: TableRows = [("part of the model", "in the file", "element of the file, or reason")]
+    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
+    lost = [name for name, entry in entries if entry["status"] == "not representable"]
+    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
+    yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
+    yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
+    if (gate := manifest["gate"]) is None:
+        return
+    if gate["status"] != "done":
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
+        return
+    rows = [("replayed channel", "error (rms) without estimates", "as exported", "noise", "unit")]
+    for name, entry in gate["channels"].items():
+        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
+        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
+    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
+    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
+    ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
+    if worst := max(ratios, key=lambda name: ratios[name], default=""):
+        text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
+        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings."
+    if gate["fall"] is not None:
+        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

@@ -31,7 +31,6 @@ from yid_ocp.report.terminal import (
     issue_summary_blocks,
     misfit_summary_blocks,
     register_summary,
-    scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
     unused_efforts_sentence,
     value_text_and_display_unit,
@@ -203,9 +202,10 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool) -> Ite
         text = f"These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
         yield f"{text} `yid-ocp identifiability FILE --what-if` lists experiments that determine more."
     if weak:
-        yield f"These parameters are only weakly determined, so use the 95 % interval: {abbreviated_names_text(weak)}."
+        advice = "Use their 95 % intervals."
         if any(free[name]["interval"] is None for name in weak):
-            yield "`yid-ocp identifiability FILE --intervals all` computes intervals of weak parameters more exactly."
+            advice = "Their 95 % intervals are rough; `yid-ocp identifiability FILE --intervals all` refines them."
+        yield f"These parameters are only weakly determined: {abbreviated_names_text(weak)}. {advice}"
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
@@ -569,39 +569,3 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
-
-
-@register_summary("yid-export/1")
-def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
-    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    listed = {
-        name: entry
-        for name, entry in manifest["parameters"].items()
-        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
-    }
-    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
-    entries = (manifest["effects"] | grasps | listed).items()
-    rows: TableRows = [("part of the model", "in the file", "element of the file, or reason")]
-    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
-    lost = [name for name, entry in entries if entry["status"] == "not representable"]
-    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
-    yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
-    yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
-    if (gate := manifest["gate"]) is None:
-        return
-    if gate["status"] != "done":
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
-        return
-    rows = [("replayed channel", "error (rms) without estimates", "as exported", "noise", "unit")]
-    for name, entry in gate["channels"].items():
-        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
-        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
-    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-    ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
-    if worst := max(ratios, key=lambda name: ratios[name], default=""):
-        text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
-        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings."
-    if gate["fall"] is not None:
-        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

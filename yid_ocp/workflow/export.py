@@ -30,7 +30,7 @@ from yid_ocp.export.signals import (
 )
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
-from yid_ocp.report.summaries import summarize_export
+from yid_ocp.report.diagnosis_summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
