@@ -301,7 +301,11 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
     yield "" if result["disturbed"] else f"The method with the lowest cost, {result['reference']}, fits best."
-    yield from (f"{n} did not converge: {e['message']}." for n, e in methods.items() if e["status"] != "converged")
+    for name, message in (
+        (name, entry["message"]) for name, entry in methods.items() if entry["status"] != "converged"
+    ):
+        # the message names the key of `solve`
+        yield f"{name} did not converge: {message.replace('solver.', f'compare.methods.{name}.')}."
     yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
     yield from (f"{sentence}." for sentence in result["explained"])
 
