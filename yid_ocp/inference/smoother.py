@@ -14,10 +14,11 @@ Their standard deviations s maximise the evidence (MacKay 1992, doi:10.1162/neco
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -199,31 +200,39 @@ def _backwards(done: _Filtered) -> _Smoothed:
 class _State:
     """Result for all recordings at given variances: also `shift` of the scaled free parameters, covariance `spread`."""
 
-    filtered: tuple[_Filtered, ...]
+    models: _Models
+    variance: _Variances
+    recordings: tuple[_Smoothed, ...]  # without those whose filter is ill-conditioned
     shift: Array
     spread: Array
     log_evidence: float
     # largest log evidence with one more group, and the group's variance
     larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
 
-    @cached_property
-    def recordings(self) -> tuple[_Smoothed, ...]:
-        """Smoothed recordings, without those whose filter is ill-conditioned."""
-        return tuple(map_in_threads(_backwards, [done for done in self.filtered if done.updates]))
-
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
         """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
-        new = [source for source in sources if source not in self.larger]
-        self.larger.update(zip(new, map_in_threads(partial(_largest_evidence, self.filtered), new), strict=True))
+        if new := [source for source in sources if source not in self.larger]:
+            filtered = map_in_threads(partial(_filtered, self.variance), self.models)
+            self.larger.update(zip(new, map_in_threads(partial(_largest_evidence, filtered), new), strict=True))
         return [self.larger[source] for source in sources]
 
 
+def _filtered(variance: _Variances, model: ResidualStateSpaceModel) -> _Filtered:
+    return _forwards(model, model.prior_variances_of_unknowns(variance))
+
+
 def _run(models: _Models, variance: _Variances) -> _State:
-    """Filter all recordings at given variances."""
-    filtered = tuple(map_in_threads(lambda m: _forwards(m, m.prior_variances_of_unknowns(variance)), models))
+    """Filter and smooth all recordings at given variances. The filters are too large to be kept."""
+
+    def smoothed(model: ResidualStateSpaceModel) -> tuple[_Filtered, list[_Smoothed]]:
+        done = _filtered(variance, model)
+        return replace(done, updates=()), [_backwards(done)] if done.updates else []
+
+    filtered, recordings = zip(*map_in_threads(smoothed, models), strict=True)
     products = np.sum([done.products for done in filtered], axis=0)
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
-    return _State(filtered, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
+    spread = scipy.linalg.cho_solve(information, np.eye(len(shift)))
+    return _State(models, variance, tuple(itertools.chain(*recordings)), shift, spread, evidence)
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
