@@ -348,10 +348,8 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
         still += [f"'{name}' follows '{mimic.joint}'"] if wanted is None or mimic.joint in wanted else []
         locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
     if still:
-        what = (
-            "%s: couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model: %s"
-        )
-        log.warning(what, Path(where).name, ", ".join(still))
+        what = "couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model"
+        log.warning("%s: %s: %s", Path(where).name, what, ", ".join(still))
     return set(following)
 
 
