@@ -173,7 +173,7 @@ def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, 
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]
     assert (found["unknowns"], found["jacobian_nonzeros"]) == (2, 4)
-    for entry, f in zip(found["functions"], swing.functions.all_functions, strict=True):
+    for entry, f in zip(found["functions"], swing.model.functions.all_functions, strict=True):
         nonzeros = sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
         assert entry == {"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros}
     assert max(entry["operations"] for entry in found["functions"]) > 100

@@ -78,11 +78,6 @@ class Step(ReprMixin):
         return self.model.equations
 
     @property
-    def functions(self) -> codegen.StepFunctions:
-        """The CasADi functions of the step equations and their derivatives."""
-        return self.model.functions
-
-    @property
     def sizes(self) -> dict[str, int]:
         """The dimensions n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx, ntheta."""
         return self.model.sizes

@@ -21,7 +21,7 @@ from yid_ocp.integrator.tracking_feedback import (
 )
 from yid_ocp.model.mechanism import depends_on_symbols
 from yid_ocp.model.system import System
-from yid_ocp.parallel import CasadiLockedCache
+from yid_ocp.parallel import CasadiLockedCache, CasadiLockedProperty
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
 from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
@@ -316,12 +316,7 @@ class ModelFunctions:
         self.step = step
         self.parameter_names, self._start_parameters = names, start_parameters
         self.input_corrections = _InputCorrectionFunctions(step.system, names, step.is_compiled)
-        self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
-        self._start_fit = CasadiLockedCache[None, InitialStateFitter](
-            lambda _: InitialStateFitter(step, start_parameters)
-        )
         self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
-        self._momentum = CasadiLockedCache[None, EffectMomentumCalculator](lambda _: EffectMomentumCalculator(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
@@ -331,25 +326,25 @@ class ModelFunctions:
         made._arms = CasadiLockedCache(lambda _: step_with_time_step(self.arms_only_integrator_step, time_step))
         return made
 
-    @property
+    @CasadiLockedProperty
     def equilibrium_solver(self) -> EquilibriumSolver:
         """The solver of the system's equilibrium equations."""
-        return self._statics(None)
+        return EquilibriumSolver(self.step)
 
-    @property
+    @CasadiLockedProperty
     def initial_state_fitter(self) -> InitialStateFitter:
         """The solver that fits an initial state to the first measured points."""
-        return self._start_fit(None)
+        return InitialStateFitter(self.step, self._start_parameters)
 
     @property
     def arms_only_integrator_step(self) -> Step:
         """The compiled step of a model of the driven arms alone, for the computation of the tracking filter's gains."""
         return self._arms(None)
 
-    @property
+    @CasadiLockedProperty
     def effect_momentum_calculator(self) -> EffectMomentumCalculator:
         """The calculator of the momentum that the model's effects add to the tracking feedback's reference."""
-        return self._momentum(None)
+        return EffectMomentumCalculator(self.step)
 
     def compiled_sensor_function(
         self, sensor: Sensor, names: tuple[str, ...] = ()
