@@ -31,7 +31,9 @@ from sound_findings import assert_sound
 from yid_ocp.data import recording_hdf5
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
+from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 diagnose_module = importlib.import_module("yid_ocp.diagnosis.diagnose")  # the function hides its module
@@ -137,6 +139,12 @@ def urdf_folder(repository) -> Path:
 
 
 @pytest.fixture(scope="session")
+def robot(urdf_folder) -> Mechanism:
+    """Two rods that hang from each other by the joints shoulder and elbow."""
+    return read_urdf(urdf_folder / "double_pendulum.urdf")
+
+
+@pytest.fixture(scope="session")
 def shared(repository) -> Path:
     """The folder of reference data that stands beside the repository."""
     folder = repository.parent / "shared"
@@ -197,7 +205,7 @@ def theta_golden(golden, paper_systems):
 
 @pytest.fixture(scope="session")
 def roll():
-    """roll(step, theta, q0, p0, steps, ...): a rollout from a state, with torque and path zero or held by default."""
+    """roll(step, theta, q0, p0, steps, ...): a converged rollout from a state, torque zero and path held by default."""
 
     def rollout(step, theta, q0, p0, steps, torque=None, path=None, z0=None, feedback=None, directions=None):
         sizes = step.sizes
@@ -206,7 +214,10 @@ def roll():
         fixed = list(step.system.prescribed_coordinate_indices)
         path = np.tile(start[fixed], (steps + 1, 1)) if path is None else path
         start[fixed] = path[0]
-        return step.kernel.rollout(RolloutInputs(np.asarray(theta, float), start, torque, path, feedback, directions))
+        inputs = RolloutInputs(np.asarray(theta, float), start, torque, path, feedback, directions)
+        found = step.kernel.rollout(inputs)
+        assert found.status.is_converged, found.status.message
+        return found
 
     return rollout
 

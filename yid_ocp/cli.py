@@ -412,7 +412,8 @@ def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
     """Print each different warning of the package once on standard error, inside a `with` block."""
-    handler, shown = logging.StreamHandler(sys.stderr), set[str]()
+    handler = logging.StreamHandler(sys.stderr)
+    shown = set[str]()
 
     def is_new(record: logging.LogRecord) -> bool:
         text = record.getMessage()

@@ -13,7 +13,6 @@ from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build_problem import load_problem
 
@@ -68,9 +67,8 @@ def twin():
 
 
 @pytest.fixture(scope="session")
-def pendulum(urdf_folder):
+def pendulum(robot):
     """pendulum(recording=None): a shoulder moved as measured, a springy elbow, the tip seen to 2 mm at 25 Hz."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
         robot, prescribed=["shoulder"], springs={"elbow": StiffnessAndRest(3.0, 0.0)}, damping=0.1, point_frames=["tip"]
     )

@@ -23,7 +23,6 @@ from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.model_functions import NodeStateValues
 
@@ -100,9 +99,8 @@ MODES = pytest.mark.parametrize("swinging", ["driven", "prescribed"], indirect=T
 
 
 @pytest.fixture(scope="module")
-def swinging(request, urdf_folder):
+def swinging(request, robot):
     """A pendulum on a springy elbow, its tip seen; the shoulder follows its torque under the filter, or its path."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     how = {request.param: ["shoulder"], "damping": 0.1, "point_frames": ["tip"]}
     system = System.build(robot, springs={"elbow": StiffnessAndRest(3.0, 0.4)}, **how)
     step, t = compile_step(system, 0.01, use_compiler=False), 0.01 * np.arange(STEPS + 1)
@@ -169,17 +167,16 @@ def test_without_sensors_only_rows_are_said(hanging):
     assert len(found["T1.bend"].rows) == 12
 
 
-def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder):
+def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, robot):
     swing = pendulum_step(urdf_folder, driven=("shoulder",))
     found = step_complexity_summary(swing)
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]
     assert (found["unknowns"], found["jacobian_nonzeros"]) == (2, 4)
-    for entry, f in zip(found["functions"], swing.functions.all_functions, strict=True):
+    for entry, f in zip(found["functions"], swing.model.functions.all_functions, strict=True):
         nonzeros = sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
         assert entry == {"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros}
     assert max(entry["operations"] for entry in found["functions"]) > 100
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
     held = {"grasps": [Grasp("hand", "tip", "w_T1")], "prescribed": ["shoulder", "elbow"]}
     tied = compile_step(System.build(robot, objects=[(rod, None, None)], **held), 0.01, use_compiler=False)
@@ -192,9 +189,8 @@ INERTIA, WEIGHT = 0.008 + 0.6 * 0.2**2, 0.6 * 9.81 * 0.2  # of the lower rod abo
 
 
 @pytest.fixture(scope="module")
-def hung_rod(urdf_folder):
+def hung_rod(robot):
     """hung_rod(stiffness, damping, mode, gravity): frequencies of the lower rod, its upper one held."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
 
     def find(stiffness=3.0, damping=0.0, mode="driven", gravity=-9.81):
         more = {"gravity": (0, 0, gravity), "damping": damping, mode: ["shoulder"]}
@@ -215,8 +211,7 @@ def test_a_rod_swings_at_the_frequency_of_its_spring_and_weight(hung_rod, mode, 
     assert (found.n_unstable_modes, found.message) == (0, "")
 
 
-def test_frequencies_of_several_joints_ascend(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+def test_frequencies_of_several_joints_ascend(robot):
     springs = {"shoulder": StiffnessAndRest(30.0), "elbow": StiffnessAndRest(3.0)}
     system = System.build(robot, springs=springs, damping=0.3, point_frames=["tip"])
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
@@ -236,8 +231,7 @@ def test_what_leaves_its_posture_grows(hung_rod):
     assert hung_rod(3.0, 0.05, gravity=9.81).n_unstable_modes == 0
 
 
-def test_what_cannot_swing_says_so(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+def test_what_cannot_swing_says_so(robot):
     system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], point_frames=["tip"])
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
@@ -250,9 +244,8 @@ def test_what_cannot_swing_says_so(urdf_folder):
 
 
 @pytest.fixture(scope="module")
-def reaching(urdf_folder):
+def reaching(robot):
     """A rod of 0.6 m on the ground, half a metre from the pendulum's line; the pendulum's tip takes its end."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
 
     def build(x=0.0, grasps=1):

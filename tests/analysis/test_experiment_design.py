@@ -33,7 +33,6 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.workflow.build_problem import load_problem
@@ -193,9 +192,8 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
 
 
 @pytest.fixture(scope="module")
-def swung(urdf_folder):
+def swung(robot):
     """swung(**options): a pendulum, the shoulder moved as measured, the elbow springy, the tip seen by a camera."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
         robot, prescribed=["shoulder"], springs={"elbow": StiffnessAndRest(3.0)}, damping=0.1, point_frames=["tip"]
     )

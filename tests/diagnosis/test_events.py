@@ -243,7 +243,7 @@ def test_up_to_three_samples_among_forty_are_named_as_wrong(count, wrong, named)
     t = 0.01 * np.arange(count)
     values = np.sin(3 * t) + 1e-4 * np.random.default_rng(0).standard_normal(count)
     values[20 : 20 + wrong] += 0.1
-    found = list(_alone(t, values, np.full(count, 1e-4), "run", ("elbow", "joints.position.elbow", "rad")))
+    found = list(_alone(t, values, np.full(count, 1e-4), ("run", "elbow", "joints.position.elbow", "rad")))
     assert len(found) == named
     for event in found:
         assert (event.start_time, event.end_time) == pytest.approx((0.195, 0.195 + 0.01 * wrong))

@@ -131,8 +131,8 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_run_ended(solv
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
-    monkeypatch.setattr(module, "max_torque_bias_change_in_stds", lambda before, after: apart)
-    monkeypatch.setattr(module, "problem_relinearized_at_torque_bias", lambda problem, x, frozen: problem)
+    monkeypatch.setattr(module.whitening, "max_torque_bias_change_in_stds", lambda before, after: apart)
+    monkeypatch.setattr(module.whitening, "problem_relinearized_at_torque_bias", lambda problem, x, frozen: problem)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
 

@@ -34,7 +34,6 @@ from yid_ocp.integrator.step import Step, compile_step, reachable_and_observable
 from yid_ocp.model import System
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.solvers import GaussNewton, fit_problem
@@ -45,10 +44,9 @@ FREE = ("elbow.stiffness", "elbow.damping")
 
 
 @pytest.fixture(scope="module")
-def step(urdf_folder) -> Step:
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
+def step(robot) -> Step:
     springs = {"elbow": StiffnessAndRest(3.0)}
-    system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
+    system = System.build(robot, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     return compile_step(system, TIME_STEP)
 
 
@@ -202,14 +200,13 @@ STRONG, REST = 0.6, 2.0
 
 
 @pytest.fixture(scope="module")
-def sprung(step, urdf_folder):
+def sprung(step, robot):
     """The pendulum with candidates, and recordings of it with a spring at the shoulder that its motor works against.
 
     The spring's torque at rest is twelve times the offset that is stated.
     """
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
     springs = {"elbow": StiffnessAndRest(3.0), "shoulder": StiffnessAndRest(STRONG)}
-    system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
+    system = System.build(robot, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
     moves = compile_step(system, TIME_STEP)
     # a spring about another angle is one about zero and a constant torque
     files = [recorded(moves, seed, -STRONG * REST) for seed in (1, 2)]

@@ -116,13 +116,12 @@ def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder
 
 
 @needs_compiler
-def test_derivatives_are_those_of_their_own_equations(parts, urdf_folder, monkeypatch, tmp_path):
+def test_derivatives_are_those_of_their_own_equations(parts, robot, monkeypatch, tmp_path):
     """Two systems whose parameters have the same names and places, and other equations."""
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
 
     def swept(split, cache):
         monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path / cache))
-        system = System.build(tree, driven=("shoulder",), damping={"shoulder": 0.3, "elbow": 0.1})
+        system = System.build(robot, driven=("shoulder",), damping={"shoulder": 0.3, "elbow": 0.1})
         made = compile_step(system, 1e-2, force_split=split)
         directions = SensitivityDirections(("elbow.damping",), np.zeros((made.sizes["nx"], 1)))
         start = np.concatenate([[0.4, -0.3], np.zeros(made.sizes["nx"] - 2)])

@@ -17,15 +17,9 @@ from yid_ocp.integrator.tracking_feedback import (
 )
 from yid_ocp.model import FlexibleSegment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import lagrangian_first_derivatives, mass_matrix
-from yid_ocp.model.urdf import read_urdf
 
 ANGLE, RATE, TORQUE = 0.02, 0.3, 1.0
 STEPS, TIME_STEP = 300, 5e-3
-
-
-@pytest.fixture(scope="module")
-def robot(urdf_folder):
-    return read_urdf(urdf_folder / "double_pendulum.urdf")
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +110,7 @@ EFFECTS = {
 
 
 @pytest.fixture(scope="module")
-def plain(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+def plain(robot):
     return System.build(robot, driven=robot.joint_names, damping=0.1)
 
 

@@ -71,7 +71,8 @@ def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, h: ca.SX) -> ca.SX
     """L_d = h L((q0 + q1)/2, (q1 - q0)/h) without effects [J s] (Marsden and West 2001, section 1.3)."""
     q, v = (q0 + q1) / 2, (q1 - q0) / h
     rigid = lagrangian_first_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
-    return h * (rigid.kinetic_energy - rigid.potential_energy - system.elastic_energy(q))
+    kinetic_energy = ca.dot(v, rigid.lagrangian_by_v) / 2
+    return h * (kinetic_energy - rigid.potential_energy - system.elastic_energy(q))
 
 
 SYSTEMS = {

@@ -46,9 +46,8 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest(parts):
 
 
 @pytest.fixture(scope="module")
-def arm(urdf_folder):
+def arm(robot):
     """The double pendulum, its elbow driven, with a spring on each joint."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     springs = {name: StiffnessAndRest(4.0, 0.1) for name in robot.joint_names}
     system = System.build(robot, driven=["elbow"], springs=springs)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False))

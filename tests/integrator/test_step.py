@@ -46,7 +46,6 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
         step = compile_step(system, 0.5 / count)
         q, v, a = smooth(np.arange(count + 1) * step.time_step)
         rollout = roll(step, theta, q[0], momentum(step, q[0], v[0], theta), count, path=q)
-        assert rollout.status.is_converged, rollout.status.message
         needed = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
         errors.append(np.max(np.abs(rollout.effort[1:] - needed[1:-1])))
         # a start with its true momentum has felt only half a step of its effort
@@ -59,7 +58,6 @@ def test_the_effort_of_a_clamp_is_the_pull_of_its_grasp(parts, roll):
     system, q = parts.clamped_cable("point")
     step = compile_step(system, 1e-3)
     rollout = roll(step, system.parameters.vector(), q, np.zeros(system.n_coordinates), 20)
-    assert rollout.status.is_converged, rollout.status.message
     np.testing.assert_allclose(rollout.effort[:, :3], rollout.multipliers / step.time_step, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(rollout.effort[:, 3:], 0.0, atol=1e-9)
 
@@ -84,7 +82,6 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
         step = compile_step(system, 0.2 / count)
         assert step.sizes["nz"] == 1
         rollout = roll(step, theta, q, np.zeros(3), count)
-        assert rollout.status.is_converged, rollout.status.message
         z = rollout.state[:, -1]
         expected = angle * (1 - np.exp(-np.arange(count + 1) * step.time_step / tau))
         errors.append(np.max(np.abs(z - expected)))
@@ -110,7 +107,6 @@ def test_a_compliance_equals_a_spring(parts, roll):
     for system in (plain, soft):
         theta = system.parameters.vector({"C.damping": 0.0})
         rollout = roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200)
-        assert rollout.status.is_converged, rollout.status.message
         states.append(rollout.state.copy())
     states[1][:, 9 + index] /= 0.5
     np.testing.assert_allclose(states[1], states[0], rtol=0, atol=1e-8)
@@ -124,7 +120,6 @@ def test_without_compliance_a_coordinate_stays_at_zero(parts, roll):
     assert system.mechanism.joint_index("C_1_y") == index
     step = compile_step(system, 1e-3)
     rollout = roll(step, system.parameters.vector(), q, np.zeros(9), 200)
-    assert rollout.status.is_converged, rollout.status.message
     # exactly in compiled code, whose elimination does not pivot
     assert np.max(np.abs(rollout.state[:, [index, 9 + index]])) <= (0.0 if step.is_compiled else 1e-18)
     assert np.ptp(rollout.state[:, 3]) > 0.01
@@ -156,7 +151,6 @@ def test_a_soft_grasp_gives_way_in_proportion_and_relaxes_with_its_time_constant
     system, q = parts.clamped_cable("point", [parts.soft_grasp("clamp", compliance, relaxation)])
     step, theta = compile_step(system, 1e-3), system.parameters.vector()
     rollout = roll(step, theta, q, np.zeros(system.n_coordinates), 30)
-    assert rollout.status.is_converged, rollout.status.message
     rigid, _ = parts.clamped_cable("point")
     plain = compile_step(rigid, 1e-3)
     nominal = rigid.parameters.vector()
@@ -175,7 +169,6 @@ def test_grasps_hold_what_they_should(parts, roll, violation, kind):
     # the clamp turns about its own axes
     path[:, 3:] += np.outer(1 - np.cos(np.linspace(0, np.pi, 101)), [0.05, -0.04, 0.08])
     rollout = roll(step, theta, q, np.zeros(system.n_coordinates), 100, path=path)
-    assert rollout.status.is_converged, rollout.status.message
     end = rollout.state[-1, : system.n_coordinates]
     assert np.max(np.abs(violation(step, end, theta))) < 1e-10
     grasp = system.grasps[0]
@@ -192,7 +185,6 @@ def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
     system, q = parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05)])
     step, theta = compile_step(system, 5e-4), system.parameters.vector()
     rollout = roll(step, theta, q, np.zeros(system.n_coordinates), 100)
-    assert rollout.status.is_converged, rollout.status.message
     slip, end = rollout.state[-1, -1], rollout.state[-1, : system.n_coordinates]
     held, holder = parts.tip(system.mechanism, "w_C", end), parts.tip(system.mechanism, "clamp", end)
     assert abs(slip) > 1e-4
@@ -202,23 +194,23 @@ def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
 
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
 class TestFailures:
-    def test_a_torque_that_is_not_a_number(self, urdf_folder, roll, use_compiler):
-        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
+    def test_a_torque_that_is_not_a_number(self, robot, use_compiler):
+        system = System.build(robot, driven=["elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         theta = system.parameters.vector()
         _, _, _, status = step([0.1, 0.2], [0.0, 0.0], [math.nan], theta)
         assert (status.is_converged, status.code, status.completed_steps) == (False, NewtonStatusCode.NOT_FINITE, 0)
         torque = np.zeros((12, 1))
         torque[7] = math.nan
-        rollout = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
+        rollout = simulate(step, theta, [0.1, 0.2, 0.0, 0.0], 12, torque)
         assert (rollout.status.code, rollout.status.completed_steps) == (NewtonStatusCode.NOT_FINITE, 7)
         assert rollout.status.message.startswith("at step 7, the state is no longer finite")
         assert np.all(np.isfinite(rollout.state[:8]))
         assert np.all(np.isnan(rollout.state[9:]))
         assert np.all(np.isnan(rollout.multipliers[7:]))
 
-    def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
-        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), prescribed=["shoulder", "elbow"])
+    def test_a_system_without_unknowns(self, robot, use_compiler):
+        system = System.build(robot, prescribed=["shoulder", "elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         pair = ([0.1, 0.2], [0.11, 0.19])
         q1, p1, lam, status = step(pair[0], [0.0, 0.0], [], system.parameters.vector(), prescribed=pair)
@@ -332,7 +324,8 @@ def test_a_loop_without_damping_keeps_its_energy(parts, urdf_folder):
     rollout = simulate(step, theta, start, 4000)
     assert rollout.status.is_converged, rollout.status.message
     e = step.equations
-    kinetic, potential = e.rigid_body_terms.kinetic_energy, e.rigid_body_terms.potential_energy
+    rigid = e.rigid_body_terms
+    kinetic, potential = ca.dot((e.q1 - e.q0) / e.h, rigid.lagrangian_by_v) / 2, rigid.potential_energy
     function = ca.Function("energy", [e.q0, e.q1, e.theta, e.time_step], [kinetic, kinetic + potential])
     states = rollout.state[:, : system.n_coordinates]
     kinetic, energy = (np.array(x).ravel() for x in function(states[:-1].T, states[1:].T, theta, 0.01))

@@ -114,16 +114,15 @@ def test_what_is_no_place_is_refused(refused_with, name, words):
     assert tree.has_frame(name) == name.startswith("T1:")
 
 
-def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
-    carrier = read_urdf(urdf_folder / "double_pendulum.urdf")
+def test_joined_mechanisms_hang_on_a_frame(robot):
     item = foam_y_object().mechanism
     placement = transform_from_xyz_rpy([0.0, 0.1, 0.0], [0.0, 0.3, 0.0])
-    both = carrier.with_attached_mechanism(item, "tip", placement)
-    assert both.joint_names == (*carrier.joint_names, *item.joint_names)
+    both = robot.with_attached_mechanism(item, "tip", placement)
+    assert both.joint_names == (*robot.joint_names, *item.joint_names)
     assert both.joints[2].parent_index == 1
     assert both.frames["object_root"].joint_index == 1
-    assert set(both.parameters.names) == {*carrier.parameters.names, *item.parameters.names}
-    expected = numbers(carrier.frames["tip"].placement.homogeneous_matrix()) @ placement
+    assert set(both.parameters.names) == {*robot.parameters.names, *item.parameters.names}
+    expected = numbers(robot.frames["tip"].placement.homogeneous_matrix()) @ placement
     expected = expected @ numbers(item.with_numeric_values().joints[0].placement.homogeneous_matrix())
     found = numbers(both.with_numeric_values().joints[2].placement.homogeneous_matrix())
     np.testing.assert_allclose(found, expected, atol=1e-15)

@@ -15,7 +15,6 @@ from yid_ocp.errors import DataError, ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
 from yid_ocp.problem.predictions import rmse_unit_count_dicts_by_channel
@@ -270,9 +269,8 @@ MIDDLE = "T1:50%"
 
 
 @pytest.fixture(scope="module")
-def buckled(urdf_folder):
+def buckled(robot):
     """The step, and the state of the shape of least energy and of its mirror image."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     placement = np.eye(4)
     placement[:3, 3] = np.array(TIP) - [0.0, 0.0, GAP]

@@ -52,7 +52,7 @@ class Twin:
         poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in frames]
         by_q = [(kinematics.position_jacobian(name), kinematics.angular_jacobian(name)) for name in frames]
         jacobians = [ca.vertcat(*pair) for pair in by_q]
-        values = [M, rigid.lagrangian_by_q, effort, rigid.kinetic_energy, rigid.potential_energy]
+        values = [M, rigid.lagrangian_by_q, effort, ca.dot(v, rigid.lagrangian_by_v) / 2, rigid.potential_energy]
         dynamics = ca.Function("dynamics", [q, v, a], values)
         return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
 

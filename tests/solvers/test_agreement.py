@@ -202,7 +202,7 @@ def test_iteration_limit_is_a_status_with_the_best_point(make_problem, pendulum)
 
 
 def test_more_memory_than_there_is_ends_with_a_status(pendulum, monkeypatch, caplog):
-    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.available_memory_bytes", lambda: 1e4)
+    monkeypatch.setattr("yid_ocp.solvers.nonlinear_program.available_memory_bytes", lambda: 1e4)
     with caplog.at_level("INFO"):
         found = MultipleShooting().minimize_cost(pendulum, pendulum.initial_unknowns, None)
     assert found.status == Status.FAILED

@@ -21,7 +21,6 @@ from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table_rows
@@ -251,8 +250,7 @@ def copied(system, values, uncounted=(), **estimates):
     return prediction_outputs.copyable_estimate_texts(system, theta, made, ("export", "my runs/a"), uncounted)
 
 
-def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(urdf_folder):
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     system = System.build(robot, springs={"elbow": StiffnessAndRest(3.0, 0.2)})
     kinds = [("joint_coulomb", "elbow"), ("rotor_inertia", "elbow"), ("joint_coulomb", "shoulder")]
     system = system.with_effects([make_effect(*own, system) for own in kinds])

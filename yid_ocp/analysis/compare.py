@@ -12,13 +12,9 @@ from pathlib import Path
 
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.profile import solution_with_profile_intervals
+from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
-from yid_ocp.inference.uncertainty import (
-    MAX_IDENTIFIABLE_RELATIVE_STD,
-    VERDICT_SENTENCE_TEXTS,
-    ParameterEstimate,
-    mark_free_estimates_not_trusted,
-)
+from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -108,7 +104,7 @@ def compare_methods(
             told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
             solution = fit_problem(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         if whole.has_process_noise:
-            solution = replace(solution, parameters=mark_free_estimates_not_trusted(solution.parameters))
+            solution = replace(solution, parameters=uncertainty.mark_free_estimates_not_trusted(solution.parameters))
         taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
@@ -161,7 +157,7 @@ def _explanations(
         elif has_process_noise and reference.verdict == "weak":
             weak.append(known)
         else:
-            sentences.append(f"{known} {VERDICT_SENTENCE_TEXTS[reference.verdict]}. {use}")
+            sentences.append(f"{known} {uncertainty.VERDICT_SENTENCE_TEXTS[reference.verdict]}. {use}")
     sentences += [f"For {', '.join(weak)}, use the 95 % interval of the column `solve`"] if weak else []
     sentences += [f"{', '.join(lost)} cannot be found, so no value is shown (–)"] if lost else []
     descents = [run for run in runs if run.method == "steepest_descent" and truth and not has_process_noise]
@@ -176,10 +172,11 @@ def _descent_errors(
     def is_far(method: _MethodResult, name: str) -> bool:
         # the same limit applies to the standard deviation of an identifiable parameter
         distance = abs(method.solution.parameters[name].value - truth[name])
-        return distance > MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[name])
+        return distance > uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[name])
 
     wrong = [name for name, entry in judged.items() if entry.free and name in truth and is_far(run, name)]
-    seen, limit = [name for name in wrong if judged[name].verdict == "identifiable"], MAX_IDENTIFIABLE_RELATIVE_STD
+    seen = [name for name in wrong if judged[name].verdict == "identifiable"]
+    limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
     if not wrong:
         return f"{run.method} ended within {100 * limit:.0f} % of the truth for all parameters"
     if not seen:

@@ -100,7 +100,8 @@ def compare_urdf_with_pinocchio(
 
 def _without(path: Path, links: Sequence[str]) -> str:
     root = ElementTree.parse(check_input_file(path, MAX_TEXT_BYTES)).getroot()
-    dropped, joints = set(links), root.findall("joint")
+    dropped = set(links)
+    joints = root.findall("joint")
     for _ in joints:
         dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}
     for joint in joints:

@@ -467,7 +467,8 @@ def innermost_location(locations: Mapping[tuple[str | int, ...], str], path: tup
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
     """Return the settings of a run, with all defaults, as YAML text. `load_config` reads the same run from it."""
-    stream, yaml = io.StringIO(), YAML()
+    stream = io.StringIO()
+    yaml = YAML()
     yaml.width = 120
     yaml.dump(_plain(run), stream)
     return stream.getvalue()

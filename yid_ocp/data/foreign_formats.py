@@ -145,7 +145,8 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     for i in range(2, min(len(axes) - 2, len(names))):
         if quantities[i : i + 3] == ["Position"] * 3 and axes[i : i + 3] == ["X", "Y", "Z"] and names[i]:
             columns.setdefault(names[i], range(i, i + 3))
-    table, unit = _numbers(body, len(axes), where), _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
+    table = _numbers(body, len(axes), where)
+    unit = _UNITS.get(said.get("Length Units", "Meters").lower(), "m")
     notes = ["Motive's y axis is up by default, and positions are not rotated. Check that the export has z up"]
     if len({names[i] for i in range(2, min(len(names), len(axes)))} - {""}) > len(columns):
         notes.append("rigid bodies and markers without a position were left out")

@@ -18,16 +18,11 @@ import scipy.special
 import scipy.stats
 
 from yid_ocp.arrays import Array
+from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, judgement_to_dict
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import (
-    EMPTY_SCREENING_RESULT,
-    CandidateDetectability,
-    ConfusabilityMatrix,
-    ScoreTestResult,
-    ScreeningResult,
-)
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, CandidateDetectability, ScoreTestResult
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
@@ -467,7 +462,7 @@ def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
     return dict(to_lossless_plain_data(kept | {"effects": [effect.label for effect in fit.effects]}))
 
 
-def _screening_to_json(screened: ScreeningResult) -> dict[str, Any]:
+def _screening_to_json(screened: screening.ScreeningResult) -> dict[str, Any]:
     labels, overlaps = screened.confusability.labels, screened.confusability.overlap_fractions
     near = [(i, j, overlaps[i, j]) for i, j in np.argwhere(overlaps >= _MIN_RECORDED_OVERLAP) if i != j]
     scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
@@ -513,13 +508,13 @@ class _RecordedCase:
         effects = tuple(self._effects[label] for label in data["effects"])
         return replace(dataclass_from_plain_data(RefitStatistics, {**data, "effects": ()}), effects=effects)
 
-    def _screening(self, data: Mapping[str, Any]) -> ScreeningResult:
+    def _screening(self, data: Mapping[str, Any]) -> screening.ScreeningResult:
         overlaps = np.eye(len(data["labels"]))
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
         scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
-        confusability = ConfusabilityMatrix(tuple(data["labels"]), overlaps)
+        confusability = screening.ConfusabilityMatrix(tuple(data["labels"]), overlaps)
         return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, confusability=confusability)
 
 

@@ -404,9 +404,10 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
                 location = sensor_bias_location_name(problem.system, sensor, sensor.frame_name_per_output[column])
-            seen, about = samples.positive_weight_mask[:, column], (location, sensor.output_names[column], sensor.unit)
+            seen = samples.positive_weight_mask[:, column]
+            about = (episode.name, location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
-            yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)
+            yield from _alone(t[seen], values, samples.std[seen, column], about)
     joints = episode.recording.joints
     if joints is None:
         return
@@ -416,8 +417,8 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
                 noise = np.full(len(joints.t), max(floor, quantization_step(values[:, column])))
-                about = (joint, f"joints.{quantity}.{joint}", unit)
-                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, episode.name, about)
+                about = (episode.name, joint, f"joints.{quantity}.{joint}", unit)
+                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, about)
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
@@ -439,9 +440,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     return std
 
 
-def _alone(
-    t: Array, values: Array, noise: Array, recording: str, about: tuple[str, str, str]
-) -> Iterator[ForceOrFaultEvent]:
+def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[ForceOrFaultEvent]:
     """Yield up to `_MAX_WRONG_SAMPLES` consecutive samples that deviate from a cubic far more than their neighbours."""
     count, many = len(values), _NEIGHBOUR_COUNT
     if count < 2 * many:
@@ -451,7 +450,7 @@ def _alone(
     wide = np.lib.stride_tricks.sliding_window_view(np.pad(size, many, mode="reflect"), 2 * many + 1)
     spread = np.maximum(noise, 1.4826 * np.median(wide, axis=1))
     odd = size > _WRONG_SAMPLE_Z * np.maximum(spread, 1e-12)
-    location, channel, unit = about
+    recording, location, channel, unit = about
     for begin in np.flatnonzero(odd & ~np.roll(odd, 1)):
         end = begin + int(np.argmin([*odd[begin:], False])) - 1
         if end - begin >= _MAX_WRONG_SAMPLES:

@@ -22,13 +22,9 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
+from yid_ocp.inference import whitening
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
-from yid_ocp.inference.whitening import (
-    max_torque_bias_change_in_stds,
-    problem_relinearized_at_torque_bias,
-    problem_with_sensor_noise_only,
-)
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -358,14 +354,14 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
     moving, _, end = found
     before, after = problem.problem.whitening_filters, moving.whitening_filters
     # without effects, all filters are fixed anew at the end of the run
-    if not effects or not end.ok or max_torque_bias_change_in_stds(before, after) < _RELINEARIZE_Z:
+    if not effects or not end.ok or whitening.max_torque_bias_change_in_stds(before, after) < _RELINEARIZE_Z:
         return found
 
     def evaluate(
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
         nonlocal moving
-        moving = problem_relinearized_at_torque_bias(moving, x, x)
+        moving = whitening.problem_relinearized_at_torque_bias(moving, x, x)
         return moving.evaluate(x, derivatives, equilibrium_guesses)
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
@@ -462,7 +458,7 @@ def held_out_loss(
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
     found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
-    for (episode, result), whitening in zip(found, problem.held_out_whitening_filters, strict=True):
+    for (episode, result), whitener in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:
             used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
@@ -473,7 +469,7 @@ def held_out_loss(
         residuals.append(np.full(len(block), np.inf))
         errors.append(np.zeros((len(block), factor.shape[1])))
         if not isinstance(result, str):
-            part = episode_residual_and_jacobian(episode, whitening, result)
+            part = episode_residual_and_jacobian(episode, whitener, result)
             residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 
@@ -485,7 +481,7 @@ def held_out_loss(
         whole = whitened(spread)
     if problem.has_process_noise:
         # errors in metres and radians are those of predictions from recorded torques minus offsets
-        found = problem_with_sensor_noise_only(problem).predict_held_out(x)
+        found = whitening.problem_with_sensor_noise_only(problem).predict_held_out(x)
     joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
     apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
     contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))

@@ -23,13 +23,7 @@ from yid_ocp.model.system import EffectStepTerms, MidpointStateSymbols, System
 
 TorqueLawQuantitiesName = Literal["angle", "speed", "angle+speed", "load", "command", "time"]
 """Quantities on which a law's torque depends: one, or two. The torque is a sum of one function of each."""
-TORQUE_LAW_QUANTITY_UNITS: Mapping[str, str] = {
-    "angle": "rad",
-    "speed": "rad/s",
-    "load": "N m",
-    "command": "N m",
-    "time": "s",
-}
+TORQUE_LAW_QUANTITY_UNITS = {"angle": "rad", "speed": "rad/s", "load": "N m", "command": "N m", "time": "s"}
 """Unit of each quantity on which a law may depend, for revolute joints."""
 _TABLE_COLUMNS = ("quantity", "unit", "at", "torque", "std")
 _SPACING_RTOL = 1e-3  # relative tolerance on equal spacing of knots in a file

@@ -81,11 +81,7 @@ class WhiteningFilter:
     torque_bias_std: Array  # standard deviation of b after all measurements, shape (nu,) [N m]
 
     def whiten_residuals_and_estimate_torque_bias(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whiten the residual and its derivatives, and estimate the constant torque errors (nu, c) [N m].
-
-        All arrays have c columns: value, then derivatives. `rows` (r, c) is the residual in units of sensor noise.
-        `push` (N, nu, c) is the torque [N m] that the tracking filter adds in each of N steps; None without a filter.
-        """
+        """Whiten rows (r, c), and estimate torque errors (nu, c) [N m], as `ProcessNoiseWhitener` describes it."""
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for part in self.filter_steps:
             result[part.rows], mean, _ = self._updated(part, mean, rows[part.rows], push)

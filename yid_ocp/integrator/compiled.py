@@ -113,9 +113,7 @@ class CompiledKernel:
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
         self._batched = CasadiLockedCache[None, tuple[ctypes.CDLL, int] | None](lambda _: _batched_library(model))
-        self._theta_columns = CasadiLockedCache[tuple[str, ...], _ThetaColumns](
-            lambda x: _theta_columns(model, library, x)
-        )
+        self._theta_columns = CasadiLockedCache(functools.partial(_theta_columns, model, library))
 
     def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> CompiledKernel:
         """Create a kernel for another step model that uses the same compiled library."""

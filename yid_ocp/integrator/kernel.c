@@ -23,6 +23,7 @@
 /* The values of NewtonStatusCode in step_model.py. */
 enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3, OUT_OF_MEMORY = 4 };
 
+typedef int (*casadi_function)(const real **, real **, long long *, real *, int);
 typedef int (*theta_function)(const double **, double **, long long *, double *, int);
 
 typedef struct {
@@ -55,18 +56,17 @@ typedef struct {
     real *q1, *z1, *lam;
 } Point;
 
-static void arguments(const Point *a, const real *args[9]) {
-    args[0] = a->q0; args[1] = a->q1; args[2] = a->p0; args[3] = a->z0; args[4] = a->z1;
-    args[5] = a->lam; args[6] = a->u; args[7] = a->theta; args[8] = a->time_step;
+/* Call one of the CasADi functions at the point. */
+static inline void call(casadi_function function, const Work *k, const Point *a, real **results) {
+    const real *args[9] = {a->q0, a->q1, a->p0, a->z0, a->z1, a->lam, a->u, a->theta, a->time_step};
+    function(args, results, k->iw, k->w, 0);
 }
 
 /* What pulls at node k, kept for the whole step because it does not depend on the unknowns. */
 static void constraint_matrix(Work *k, const Point *a) {
     if (M == 0) return;
-    const real *args[9];
-    real *res[1] = {k->matrix_nz};
-    arguments(a, args);
-    matrix(args, res, k->iw, k->w, 0);
+    real *results[1] = {k->matrix_nz};
+    call(matrix, k, a, results);
     for (int e = 0; e < NNZ_MATRIX; e++) k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e];
 }
 
@@ -81,10 +81,8 @@ static void pull_by(Work *k, const real *lam) {
 /* Take the multipliers' pull off p1, once all unknowns are known. */
 static void finish(Work *k, const Point *a) {
     if (!MIDDLE || M == 0) return;
-    const real *args[9];
-    real *res[1] = {k->right_nz};
-    arguments(a, args);
-    ending(args, res, k->iw, k->w, 0);
+    real *results[1] = {k->right_nz};
+    call(ending, k, a, results);
     for (int e = 0; e < NNZ_MATRIX; e++) {
         const int i = matrix_col[e];
         k->right_nz[e] = k->middle_nz[e] - k->right_nz[e];
@@ -95,10 +93,8 @@ static void finish(Work *k, const Point *a) {
 /* Full rows of the balance (N), internal (NZ) and constraint (M) equations at the point; p1 on the way, but for what
  * `finish` adds. Whether all is finite. */
 static mask evaluate(Work *k, const Point *a) {
-    const real *args[9];
-    real *res[5] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz};
-    arguments(a, args);
-    residual(args, res, k->iw, k->w, 0);
+    real *results[5] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz};
+    call(residual, k, a, results);
     for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++)
         k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e] + k->middle_nz[e];
     pull_by(k, a->lam);
@@ -131,10 +127,8 @@ static inline void pair_entries(const real *W, const real *g, const real *V, con
 
 /* Jacobians of the rows and of p1; `everything` adds those with respect to q_k, z_k and u. */
 static void linearise(Work *k, const Point *a, int everything) {
-    const real *args[9];
-    real *res[5] = {k->pairs, k->rest, k->rest_p, k->by_unknown, k->curve_nz};
-    arguments(a, args);
-    linear(args, res, k->iw, k->w, 0);
+    real *results[5] = {k->pairs, k->rest, k->rest_p, k->by_unknown, k->curve_nz};
+    call(linear, k, a, results);
     const real *P = k->pairs, *D = P + 6 * N, *X = D + 6 * N, *Y = X + 6 * N, *W = Y + 6 * N, *G = W + 3 * N;
     memset(k->R1, 0, sizeof k->R1);
     if (everything) {
@@ -224,7 +218,7 @@ static void linearise(Work *k, const Point *a, int everything) {
     }
     if (M > 0) {
         real *pulls[2] = {k->pull_nz, k->after_curve_nz};
-        pull(args, pulls, k->iw, k->w, 0);
+        call(pull, k, a, pulls);
         for (int e = 0; e < NNZ_PULL; e++)
             k->R0[pull_row[e]][pull_col[e]] -= k->row_scale[pull_row[e]] * k->pull_nz[e];
         for (int e = 0; e < NNZ_AFTER_CURVE; e++)
@@ -522,10 +516,8 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
 static void prepare(Work *k, const real *theta, const real *time_step) {
     real none[ONE(NX)] = {0};
     Point a = {none, none, none, none, theta, time_step, none, none, none};
-    const real *args[9];
-    real *res[2] = {k->row_scale, &k->h};
-    arguments(&a, args);
-    scales(args, res, k->iw, k->w, 0);
+    real *results[2] = {k->row_scale, &k->h};
+    call(scales, k, &a, results);
 }
 
 /* C[rows] += A X for the listed nonzero columns of each row; A has `width` columns, X has d, and room for BLOCK entries

@@ -18,7 +18,7 @@ from yid_ocp.integrator.discrete import RIGID_HOLD_STIFFNESS, EquilibriumEquatio
 from yid_ocp.integrator.step import Step, float_array_with_checked_shape
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
-from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
+from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache, CasadiLockedProperty
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,6 @@ class EquilibriumSolver:
         self.free_coordinates = system.unprescribed_coordinate_indices
         rows = system.n_coordinates + e.z0.numel() + e.lam.numel()
         self._sought = [*self.free_coordinates, *range(system.n_coordinates, rows)]
-        self._equations = CasadiLockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
         self._inner_slopes = CasadiLockedCache[None, ca.Function](
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
@@ -75,10 +74,10 @@ class EquilibriumSolver:
         self._least_energy: dict[bytes, _StaticSolution] = {}  # by the last searches without a guess
         self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
-    @property
+    @CasadiLockedProperty
     def symbolic_equations(self) -> EquilibriumEquations:
         """The symbolic equilibrium equations of the system."""
-        return self._equations(None)
+        return equilibrium_equations(self.step.equations)
 
     def solve(
         self,
@@ -251,9 +250,9 @@ class EquilibriumSolver:
             part[:n] += of_p
         if nz:
             inner, at = slice(n, n + nz), (q, q, none, z, z, lam, u, theta, step.time_step)
-            residual, nonzeros = (np.array(x).ravel() for x in step.functions.function("resting")(*at))
+            residual, nonzeros = (np.array(x).ravel() for x in step.model.functions.function("resting")(*at))
             slopes = np.zeros((nz, n + nz + m + nu))
-            slopes[rows_and_columns_of_nonzeros(step.functions.sparsity_patterns["resting"])] = nonzeros
+            slopes[rows_and_columns_of_nonzeros(step.model.functions.sparsity_patterns["resting"])] = nonzeros
             rows[0][inner], by_rows[inner], rows[2][inner] = residual, slopes[:, : n + nz + m], slopes[:, n + nz + m :]
             by_rows[inner, driven] -= hold.stiffness * rows[2][inner]
             if names:

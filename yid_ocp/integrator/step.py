@@ -78,11 +78,6 @@ class Step(ReprMixin):
         return self.model.equations
 
     @property
-    def functions(self) -> codegen.StepFunctions:
-        """The CasADi functions of the step equations and their derivatives."""
-        return self.model.functions
-
-    @property
     def sizes(self) -> dict[str, int]:
         """The dimensions n (coordinates), nz (internal), m (constraints), nu (inputs), nc (prescribed), nx, ntheta."""
         return self.model.sizes
@@ -158,10 +153,8 @@ class Step(ReprMixin):
             allowed = f"(s0, s1): their values at the start and at the end of the step, each of shape ({sizes['nc']},)"
             raise ModelError(what, where="prescribed", allowed=allowed, hint="pass prescribed=(s0, s1) [rad or m]")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
-        start[list(self.system.prescribed_coordinate_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
-        values = check("theta", theta, (sizes["ntheta"],))
-        return self.kernel.rollout(RolloutInputs(values, start, torque, path, None, wanted))
+        return self.kernel.rollout(checked_rollout_inputs(self, theta, start, 1, torque, path, None, wanted))
 
 
 def compile_step(

@@ -115,7 +115,8 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
     # the kernel takes consecutive states: each start and its successor; the steps between these pairs are not used
     state, torques = np.repeat(start, 2, axis=0), np.repeat(torque, 2, axis=0)[:-1]
     state[1::2, :nu] = guess
-    none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
+    none = np.zeros((2 * count - 1, 0))
+    own = slice(None, None, 2)
     try:
         for _ in range(NEWTON_ITERATION_LIMIT):
             found = arm_step.kernel.step_residuals_and_jacobians(theta, state, none, torques, (), True)

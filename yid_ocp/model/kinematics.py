@@ -70,7 +70,6 @@ class LagrangianFirstDerivatives:
 
     lagrangian_by_q: ca.SX  # shape (n, 1)
     lagrangian_by_v: ca.SX  # shape (n, 1)
-    kinetic_energy: ca.SX  # [J]
     potential_energy: ca.SX  # [J]
     S: ca.SX  # S, D, F and B have the shape (6, n)
     D: ca.SX
@@ -117,7 +116,7 @@ def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.S
         above = velocity[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
         D.append(motion_cross_motion_product(above, S[j]) if joint.parent_index >= 0 else above)
         velocity.append(above + S[j] * v[j])
-    moved, kinetic, potential = _moved(kinematics, velocity, gravity)
+    moved, potential_energy = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
     for j, part in enumerate(moved):
         moment, weight = ca.cross(part.heavy_first, gravity), part.heavy * gravity
@@ -131,7 +130,7 @@ def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.S
     gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
     columns = ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))
     vectors = [ca.densify(ca.horzcat(ca.SX(rows, 0), *entries)) for entries, rows in columns]
-    return LagrangianFirstDerivatives(*[*gradients, kinetic, potential, *vectors])
+    return LagrangianFirstDerivatives(*[*gradients, potential_energy, *vectors])
 
 
 @dataclass
@@ -154,11 +153,11 @@ class _Moved:
         return ca.vertcat(self.second @ motion[:3] + ca.cross(self.first, motion[3:]), force)
 
 
-def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
-    """Mass moments and momentum of the bodies that each joint moves, and the kinetic and potential energy [J]."""
+def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX]:
+    """Mass moments and momentum of the bodies that each joint moves, and the potential energy [J]."""
     joints = kinematics.mechanism.joints
     moved = [_Moved() for _ in joints]
-    kinetic, potential = ca.SX(0), ca.SX(0)
+    potential_energy = ca.SX(0)
     # if a body's weight is not mass times gravity, weights are summed separately from inertia
     apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
     for j, joint in enumerate(joints):
@@ -167,12 +166,10 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
             about_com = _rotated_tensor(body, kinematics.joint_rotations[j])
             angular, linear = velocity[j][:3], velocity[j][3:] + ca.cross(velocity[j][:3], com)
             impulse = body.mass * linear
-            spin = about_com @ angular
-            kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
             heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
-            potential -= heavy * ca.dot(gravity, com)
+            potential_energy -= heavy * ca.dot(gravity, com)
             second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
-            momentum = ca.vertcat(spin + ca.cross(com, impulse), impulse)
+            momentum = ca.vertcat(about_com @ angular + ca.cross(com, impulse), impulse)
             moved[j].add(_Moved(body.mass, body.mass * com, second, momentum, heavy, heavy * com))
     for j in reversed(range(len(joints))):
         if joints[j].parent_index >= 0:
@@ -180,7 +177,7 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     if not apart:
         for part in moved:
             part.heavy, part.heavy_first = part.mass, part.first
-    return moved, kinetic, potential
+    return moved, potential_energy
 
 
 def mass_matrix(rigid: LagrangianFirstDerivatives, mechanism: Mechanism) -> ca.SX:

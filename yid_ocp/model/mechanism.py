@@ -268,6 +268,11 @@ class Mechanism(ReprMixin):
         return replace(self, joints=tuple(joints), frames=frames)
 
 
+def depends_on_symbols(expression: ca.SX, symbols: ca.SX) -> bool:
+    """Return whether an expression depends on one of the symbols. Both may be empty."""
+    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
+
+
 def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
     """Return a model description in which `change` was applied to every symbolic expression except the parameters."""
     if isinstance(description, ca.SX):

@@ -132,7 +132,8 @@ def read_urdf(
     exclude_links : sequence of str
         Links to remove together with their subtrees, such as a tool that is not mounted.
     """
-    file, locked = urdf_path_from_robot_name(path), dict(locked or {})
+    file = urdf_path_from_robot_name(path)
+    locked = dict(locked or {})
     if not is_file(file):
         hint = "correct the path, or use a known robot, such as package:ur5"
         with contextlib.suppress(ModelError):
@@ -234,7 +235,8 @@ def joint_damping_and_friction(robot: str | Path) -> tuple[dict[str, float], dic
 def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:
     if element is None:
         return None
-    moments, tensor = element.find("inertia"), np.zeros((3, 3))
+    moments = element.find("inertia")
+    tensor = np.zeros((3, 3))
     if moments is not None:
         for key, (i, j) in _TENSOR_KEYS.items():
             tensor[i, j] = tensor[j, i] = float(moments.attrib[key])
@@ -348,10 +350,8 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
         still += [f"'{name}' follows '{mimic.joint}'"] if wanted is None or mimic.joint in wanted else []
         locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
     if still:
-        what = (
-            "%s: couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model: %s"
-        )
-        log.warning(what, Path(where).name, ", ".join(still))
+        what = "couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model"
+        log.warning("%s: %s: %s", Path(where).name, what, ", ".join(still))
     return set(following)
 
 
@@ -480,7 +480,8 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
     for i, joint in enumerate(mechanism.joints):
         link, body = ElementTree.SubElement(robot, "link", name=links[i + 1]), merge_inertias(joint.bodies)
         if body is not None:
-            inertial, tensor = ElementTree.SubElement(link, "inertial"), np.array(ca.DM(body.inertia_about_com))
+            inertial = ElementTree.SubElement(link, "inertial")
+            tensor = np.array(ca.DM(body.inertia_about_com))
             com = _digits(np.array(ca.DM(body.center_of_mass)).ravel())
             ElementTree.SubElement(inertial, "origin", xyz=com, rpy="0 0 0")
             ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))

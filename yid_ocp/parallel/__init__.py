@@ -9,6 +9,7 @@ from yid_ocp.parallel.resumable_tasks import return_freed_memory as return_freed
 from yid_ocp.parallel.resumable_tasks import run_tasks as run_tasks
 from yid_ocp.parallel.threads_and_processes import CASADI_LOCK as CASADI_LOCK
 from yid_ocp.parallel.threads_and_processes import CasadiLockedCache as CasadiLockedCache
+from yid_ocp.parallel.threads_and_processes import CasadiLockedProperty as CasadiLockedProperty
 from yid_ocp.parallel.threads_and_processes import InlineExecutor as InlineExecutor
 from yid_ocp.parallel.threads_and_processes import available_processor_count as available_processor_count
 from yid_ocp.parallel.threads_and_processes import call_merged_with_other_threads as call_merged_with_other_threads

@@ -12,8 +12,9 @@ import threading
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import islice
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from yid_ocp.errors import ConfigError
 
@@ -72,6 +73,16 @@ class CasadiLockedCache(Generic[_Key, _Value]):
                 if key not in self._known:
                     self._known[key] = self._make(key)
         return self._known[key]
+
+
+class CasadiLockedProperty(cached_property[_Value]):
+    """A cached property that one thread computes under the CasADi lock while other threads wait."""
+
+    if not TYPE_CHECKING:  # the type is that of `cached_property`
+
+        def __get__(self, instance: object, owner: type | None = None) -> _Value:
+            with CASADI_LOCK:
+                return super().__get__(instance, owner)
 
 
 class _Abandoned(BaseException):

@@ -305,7 +305,7 @@ def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
-    pairs = np.array(step.functions.function("linear")(*state, theta, step.time_step)[0]).ravel()
+    pairs = np.array(step.model.functions.function("linear")(*state, theta, step.time_step)[0]).ravel()
     plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
     mass = np.sum(plus * (upper - lower), axis=0) * step.time_step / 2
     return np.asarray(mass[[step.system.mechanism.joint_index(name) for name in names]])

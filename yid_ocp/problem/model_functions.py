@@ -19,8 +19,9 @@ from yid_ocp.integrator.tracking_feedback import (
     RecordedMotionWithSensitivities,
     compile_driven_arms_only_step,
 )
+from yid_ocp.model.mechanism import depends_on_symbols
 from yid_ocp.model.system import System
-from yid_ocp.parallel import CasadiLockedCache
+from yid_ocp.parallel import CasadiLockedCache, CasadiLockedProperty
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
 from yid_ocp.sensors import Sensor, sensor_function_with_jacobians
 
@@ -127,9 +128,9 @@ class _InputCorrectionFunctions:
         angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
         true_angle, true_effort = self._corrected(angle, effort)
         theta = system.parameters.symbols
-        self.corrects_angles = _depends(true_angle, theta)
-        self.corrects_efforts = _depends(true_effort, theta)
-        self.angles_depend_on_effort = _depends(true_angle, effort)
+        self.corrects_angles = depends_on_symbols(true_angle, theta)
+        self.corrects_efforts = depends_on_symbols(true_effort, theta)
+        self.angles_depend_on_effort = depends_on_symbols(true_angle, effort)
         self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         self._times = {
             "torque_delay": self._with_jacobian([self._delay(f"torque.{joint}", False) for joint in system.driven]),
@@ -138,7 +139,7 @@ class _InputCorrectionFunctions:
         }
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
         outputs, true = [true_angle, true_effort, ca.densify(slope)], ca.vertcat(true_angle, true_effort)
-        self._correcting = [name for name in names if _depends(true, system.parameters[name].symbol)]
+        self._correcting = [name for name in names if depends_on_symbols(true, system.parameters[name].symbol)]
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self._correcting))
 
         def compiled(differentiated: bool) -> MappedFunction:
@@ -211,7 +212,7 @@ class _InputCorrectionFunctions:
     def _with_jacobian(self, entries: Sequence[ca.SX]) -> ca.Function | None:
         """Function of theta with its derivative by the chosen parameters; None if it is independent of theta."""
         expression, theta = ca.vertcat(ca.SX(0, 1), *entries), self.system.parameters.symbols
-        if not _depends(expression, theta):
+        if not depends_on_symbols(expression, theta):
             return None
         return ca.Function("times", [theta], [expression, ca.jacobian(expression, self._chosen)])
 
@@ -223,10 +224,6 @@ class _InputCorrectionFunctions:
         value, slope = (np.array(ca.densify(x)) for x in function(theta))
         slope = slope.reshape(value.size, len(self._names))[:, [self._names.index(name) for name in wanted]]
         return (value.ravel(), slope) if value.any() or slope.any() else None
-
-
-def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
-    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
 
 
 @dataclass(frozen=True)
@@ -319,12 +316,7 @@ class ModelFunctions:
         self.step = step
         self.parameter_names, self._start_parameters = names, start_parameters
         self.input_corrections = _InputCorrectionFunctions(step.system, names, step.is_compiled)
-        self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
-        self._start_fit = CasadiLockedCache[None, InitialStateFitter](
-            lambda _: InitialStateFitter(step, start_parameters)
-        )
         self._arms = CasadiLockedCache[None, Step](lambda _: compile_driven_arms_only_step(step))
-        self._momentum = CasadiLockedCache[None, EffectMomentumCalculator](lambda _: EffectMomentumCalculator(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     def with_time_step(self, time_step: float) -> ModelFunctions:
@@ -334,25 +326,25 @@ class ModelFunctions:
         made._arms = CasadiLockedCache(lambda _: step_with_time_step(self.arms_only_integrator_step, time_step))
         return made
 
-    @property
+    @CasadiLockedProperty
     def equilibrium_solver(self) -> EquilibriumSolver:
         """The solver of the system's equilibrium equations."""
-        return self._statics(None)
+        return EquilibriumSolver(self.step)
 
-    @property
+    @CasadiLockedProperty
     def initial_state_fitter(self) -> InitialStateFitter:
         """The solver that fits an initial state to the first measured points."""
-        return self._start_fit(None)
+        return InitialStateFitter(self.step, self._start_parameters)
 
     @property
     def arms_only_integrator_step(self) -> Step:
         """The compiled step of a model of the driven arms alone, for the computation of the tracking filter's gains."""
         return self._arms(None)
 
-    @property
+    @CasadiLockedProperty
     def effect_momentum_calculator(self) -> EffectMomentumCalculator:
         """The calculator of the momentum that the model's effects add to the tracking feedback's reference."""
-        return self._momentum(None)
+        return EffectMomentumCalculator(self.step)
 
     def compiled_sensor_function(
         self, sensor: Sensor, names: tuple[str, ...] = ()

@@ -13,24 +13,16 @@ from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.linearized_residual import (
-    bounded_levenberg_marquardt_step,
-    max_abs_projected_gradient,
-    predicted_cost_reduction_by_step,
-)
+from yid_ocp.inference import linearized_residual
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, max_abs_projected_gradient
 from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.episodes import InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
-from yid_ocp.solvers import base, symbolic_transcription
+from yid_ocp.solvers import base, nonlinear_program, symbolic_transcription
 from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_of_non_effort_residuals
-from yid_ocp.solvers.nonlinear_program import (
-    QUIET_NLPSOL_OPTIONS,
-    HessianKind,
-    NonlinearProgram,
-    available_memory_bytes,
-)
+from yid_ocp.solvers.nonlinear_program import QUIET_NLPSOL_OPTIONS, HessianKind, NonlinearProgram
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +119,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         assert program.ridge is not None
         ridge = _AdaptiveRidge(program.ridge.scale, program.w.numel())
         program = replace(program, ridge=replace(program.ridge, factor=ridge))
-        needed, free = program.estimated_solver_memory(self.hessian), available_memory_bytes()
+        needed, free = program.estimated_solver_memory(self.hessian), nonlinear_program.available_memory_bytes()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
@@ -195,7 +187,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             low = (np.where(positive, np.maximum(low, x / _MAX_CHANGE_FACTOR), low) - x) / size
             high = (np.where(positive, np.minimum(high, largest), high) - x) / size
             step = size * bounded_levenberg_marquardt_step(now.jacobian * size, closed, mu, low, high)
-            promised = predicted_cost_reduction_by_step(now.jacobian, closed, step)
+            promised = linearized_residual.predicted_cost_reduction_by_step(now.jacobian, closed, step)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:

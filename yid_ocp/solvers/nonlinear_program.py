@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,7 +22,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import SolverError, unknown_name_error_arguments
 from yid_ocp.integrator.compiler import compile_casadi_function
-from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
+from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache, CasadiLockedProperty
 
 HessianKind = Literal["gauss_newton", "exact"]
 # Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
@@ -34,14 +33,6 @@ QUIET_NLPSOL_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "pr
 
 # Options that fit programs of one size only.
 _SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
-
-
-class _ThreadSafeCachedProperty(cached_property[Any]):
-    """Cached property that one thread computes under CasADi's lock while other threads wait."""
-
-    def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
-        with CASADI_LOCK:
-            return super().__get__(instance, owner)
 
 
 class LocalVariableFunction:
@@ -67,7 +58,7 @@ class LocalVariableFunction:
     def _compiled(self, function: ca.Function) -> ca.Function:
         return compile_casadi_function(function) if self._use_compiler else function
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def _weighted_hessian_function(self) -> ca.Function | None:
         """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None if y is linear."""
         # one product with a direction, for each colour of the pattern: the whole would be millions of operations
@@ -359,12 +350,12 @@ class NonlinearProgram(ReprMixin):
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def f(self) -> ca.MX:
         """Return the symbolic scalar objective f(w, p)."""
         return sum((*self._losses, *(extra.objective for extra in self.user_terms)), ca.MX(0))
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def g(self) -> ca.MX:
         """Return the symbolic constraint functions g(w, p), shape (ng, 1)."""
         terms = (term._symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
@@ -383,11 +374,11 @@ class NonlinearProgram(ReprMixin):
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
         return {"x0": self.initial_guess, "p": self.parameter_values, **bounds}
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def _residuals(self) -> list[ca.MX]:
         return [term._symbolic_outputs(self.w, self.p) for term in self.residual_terms]
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def _slopes(self) -> list[ca.MX]:
         return [term.jacobian(self.w, self.p) for term in self.residual_terms]
 
@@ -395,17 +386,17 @@ class NonlinearProgram(ReprMixin):
     def _losses(self) -> list[ca.MX]:
         return [term._evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def residual(self) -> ca.MX:
         """Return the symbolic residuals r(w, p) of the objective's least-squares terms, (nr, 1)."""
         return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def jac_r(self) -> ca.MX:
         """Return the sparse Jacobian of all residuals r with respect to the variables w."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def jac_g(self) -> ca.MX:
         """Return the sparse Jacobian of the constraints g with respect to the variables w."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
@@ -419,7 +410,7 @@ class NonlinearProgram(ReprMixin):
         placed = _sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
         return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def grad_f(self) -> ca.MX:
         """Return the gradient of the objective f with respect to the variables w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
@@ -428,17 +419,17 @@ class NonlinearProgram(ReprMixin):
             total += ca.mtimes(slope.T, term._loss_gradient_by_residual(r))
         return total
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def lam_f(self) -> ca.MX:
         """Return the symbolic factor on the objective f in the Lagrangian of `hessian`."""
         return ca.MX.sym("lam_f")
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def lam_g(self) -> ca.MX:
         """Return the symbolic multipliers of the constraints g in the Lagrangian, shape (ng, 1)."""
         return ca.MX.sym("lam_g", self.g.numel())
 
-    @_ThreadSafeCachedProperty
+    @CasadiLockedProperty
     def _hessians(self) -> CasadiLockedCache[bool, ca.MX]:
         return CasadiLockedCache(lambda exact: self._data_curvature(exact) + self._other_curvature(exact))
 

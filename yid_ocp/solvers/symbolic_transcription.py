@@ -270,7 +270,8 @@ class _Maker:
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
         theta = problem.theta_of_episode(found.x, i)
-        rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
+        rest = np.zeros(0)
+        sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
             rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])
         joints = system.mechanism.joint_names

@@ -518,7 +518,7 @@ def run_experiment_with_injected_effects(
     held = [] if ordinary_friction is None else [e for e in inner if e.kind in _ORDINARY_FRICTION]
     inner = [e for e in inner if e not in held]
     held += ordinary_friction or ()
-    injected = _InjectedTerms(changed, values, inner, held) if inner or held else None
+    injected = _InjectedTerms(_EffectContext(changed, values), inner, held) if inner or held else None
     chosen = replace(experiment or VirtualExperimentSettings(), injected_terms=injected, gear_play=play)
     made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
@@ -527,24 +527,20 @@ def run_experiment_with_injected_effects(
     return made
 
 
+@dataclass
 class _InjectedTerms:
     """The injected effects as `InjectedSimulatorTerms`. The amplitudes of `held_frictions` at the same joint add up."""
 
-    def __init__(
-        self,
-        system: System,
-        values: Mapping[str, float],
-        effects: Sequence[InjectedEffect],
-        held_frictions: Sequence[InjectedEffect] = (),
-    ) -> None:
-        self._effects, self._forces = tuple(effects), list[_ForceCallback]()
-        self._scene, self._held_frictions = _EffectContext(system, values), tuple(held_frictions)
+    scene: _EffectContext
+    effects: Sequence[InjectedEffect]
+    held_frictions: Sequence[InjectedEffect]
+    _forces: list[_ForceCallback] = field(default_factory=list)
 
     def edit_model(self, model: Any) -> None:
-        if self._held_frictions:
-            self._forces.append(_held_friction(self._scene, model, self._held_frictions))
-        for effect in self._effects:
-            size, place, scene = effect.values, effect.location, self._scene
+        if self.held_frictions:
+            self._forces.append(_held_friction(self.scene, model, self.held_frictions))
+        for effect in self.effects:
+            size, place, scene = effect.values, effect.location, self.scene
             if effect.kind == "kelvin_voigt":
                 at, stiffness, _ = scene.segment_springs(model, place)
                 model.dof_damping[at] += size["tau"] * stiffness
@@ -560,7 +556,7 @@ class _InjectedTerms:
                 self._forces.append(OUT_OF_LIBRARY_FORCE_BUILDERS[effect.kind](scene, model, place, size["size"]))
 
     def begin_motion(self, data: Any) -> None:
-        self._scene.has_motion_begun = True
+        self.scene.has_motion_begun = True
 
     def add_forces(self, model: Any, data: Any) -> None:
         for push in self._forces:

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, ModelError, import_optional
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_inertias
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, depends_on_symbols, merge_inertias
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointStateSymbols, System
 
@@ -117,7 +117,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
         "servo_firmware": (p for s in system.servos.values() for p in (s.dead_band, s.current_limit_tightness)),
         "clock": (system.recorded_time_scale,),
     }
-    return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
+    return {name for name, parts in entered.items() if any(depends_on_symbols(part, symbols) for part in parts)}
 
 
 def effect_joint_terms_and_changed_aspects(
@@ -206,7 +206,7 @@ def _joint_terms(system: System, effect: Effect, value: CasadiEvaluator) -> dict
     if ca.sparsify(ca.vertcat(energy, force)).is_zero():
         return {}
     momentum = ca.gradient(energy, v)
-    if _depends(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
+    if depends_on_symbols(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
         return None
     ones = ca.SX.ones(n)
     by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
@@ -231,10 +231,6 @@ def _joint_terms(system: System, effect: Effect, value: CasadiEvaluator) -> dict
         for i, joint in enumerate(system.mechanism.joint_names)
         if np.any(np.abs([slope[i], pull[i], twisted[i], damping[i], armature[i]]) > scale)
     }
-
-
-def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
-    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
 
 
 def mujoco_xml(

@@ -14,6 +14,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, NamedTuple
 
@@ -28,15 +29,7 @@ from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
-from yid_ocp.vision.shape_evidence import (
-    FrameShapeFit,
-    ProcessedFrameCloud,
-    QuadraticTubeDimensionCost,
-    ShapeFitQuality,
-    ShapeFitQualityAndPointClasses,
-    TubeLinks,
-    nearest_link_axis_projections,
-)
+from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud, ShapeFitQualityAndPointClasses
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
 from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
@@ -203,8 +196,8 @@ class ShapeFitter:
         """Configurations of other shapes that may fit the cloud, one for each tube that a foreign object touches."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
-        tubes = self.tube_links_at_configuration(best.q)
-        touched = nearest_link_axis_projections(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
+        tubes, contested = self.tube_links_at_configuration(best.q), sight.points[evidence.is_contested]
+        touched = shape_evidence.nearest_link_axis_projections(tubes.link_ends, tubes.radius, contested)[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
@@ -227,9 +220,9 @@ class ShapeFitter:
     ) -> _Left:
         """Masks of the nodes and points that are not on the links of the mask `links`."""
         tubes, nodes = self.tube_links_at_configuration(best.q), sight.skeleton_nodes
-        link = nearest_link_axis_projections(tubes.link_ends, tubes.radius, sight.points)[0]
-        wrong = links[link] & (evidence.is_own | evidence.is_contested)
-        at, _, _, distance = nearest_link_axis_projections(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
+        project = partial(shape_evidence.nearest_link_axis_projections, tubes.link_ends, tubes.radius)
+        wrong = links[project(sight.points)[0]] & (evidence.is_own | evidence.is_contested)
+        at, _, _, distance = project(nodes, _NODE_RADIUS_FRACTION)
         return ~(links[at] & (distance < 2 * tubes.radius[at])), ~wrong
 
     def _attempt(
@@ -322,7 +315,7 @@ class ShapeFitter:
         held = {grasp.held_frame for grasp in self.system.grasps}
         seen = (touching & sure[:, None]).any(axis=0) | np.array([name in held for name in self.system.point_frames])
         return FrameShapeFit(
-            **{entry.name: getattr(evidence, entry.name) for entry in fields(ShapeFitQuality)},
+            **{entry.name: getattr(evidence, entry.name) for entry in fields(shape_evidence.ShapeFitQuality)},
             q=q,
             point_positions=places,
             point_std=np.sqrt(np.maximum(spread, 0.0) + moved**2 + swath**2 + off_end**2),
@@ -375,7 +368,7 @@ class ShapeFitter:
 
     def _size_rows(
         self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
-    ) -> QuadraticTubeDimensionCost:
+    ) -> shape_evidence.QuadraticTubeDimensionCost:
         """Cost of tube lengths and radii in a frame, from the points of the pass `task` at the fitted shape `q`."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
@@ -416,11 +409,11 @@ class ShapeFitter:
         left = both[free:] - hessian[free:, :free] @ follow
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - self._seen(q)[1] @ follow[:, 1:]
-        return QuadraticTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
+        return shape_evidence.QuadraticTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
-    def tube_links_at_configuration(self, q: Array) -> TubeLinks:
+    def tube_links_at_configuration(self, q: Array) -> shape_evidence.TubeLinks:
         """Return the links of the object as tubes in the world at the configuration `q`."""
-        return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
+        return shape_evidence.TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
     def gripper_positions_at_configuration(self, q: ArrayLike) -> Array:
         """Return the positions (grasps, 3) [m] of the grippers' frames at a configuration."""

@@ -32,12 +32,7 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap, dropped_frame_error
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
-from yid_ocp.vision.sequence_calibration import (
-    BackgroundPoints,
-    ForeignObject,
-    SequenceEstimates,
-    TubeDimensionEstimates,
-)
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, SequenceEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ShapeGuessFinder, add_free_root_joints, cloud_centerline_tree
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneDescription, TriangleMesh
@@ -227,7 +222,7 @@ class SingleFrameTracker:
             what, allowed = f"the clocks differ: {spans}", f"times that overlap if shifted by up to {reach:g} s"
             raise DataError(what, where=self.sequence.source, allowed=allowed, hint=hint)
 
-    def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
+    def _shape(self, sizes: sequence_calibration.TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
         used = sizes.estimated_dimension_mask
         key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
@@ -346,7 +341,7 @@ class SingleFrameTracker:
             _place=lambda q: place(q)[columns],
         )
 
-    def find_foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[ForeignObject, ...]:
+    def find_foreign_objects(self, frames: Sequence[FrameReport]) -> tuple[sequence_calibration.ForeignObject, ...]:
         """Return what is near the tracked object and neither it nor the robot, one entry for each foreign object."""
         fitted = [(frame.joint_time, frame.shape_fit) for frame in frames if frame.shape_fit is not None]
         if not fitted:

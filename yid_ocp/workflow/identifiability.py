@@ -16,11 +16,7 @@ from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.analysis import what_if
 from yid_ocp.analysis.estimation import problem_without_shape_memory
 from yid_ocp.analysis.experiment_design import UnchangedExperiment
-from yid_ocp.analysis.identifiability import (
-    GRASP_OFFSET_PRIOR_STD,
-    IdentifiabilityResult,
-    system_with_grasp_offset_effects,
-)
+from yid_ocp.analysis.identifiability import IdentifiabilityResult, system_with_grasp_offset_effects
 from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough_for_profiles
 from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
@@ -72,7 +68,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     asked = IdentifiabilityOptions(
         evaluation_point="initial" if arguments.initial else "solution",
         start_knowledge="unknown" if arguments.unknown_start else "assumed",
-        grasp_offset_std=GRASP_OFFSET_PRIOR_STD if arguments.unknown_grasp else None,
+        grasp_offset_std=fisher.GRASP_OFFSET_PRIOR_STD if arguments.unknown_grasp else None,
         interval_parameters={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         rank_changes=arguments.what_if,
     )
@@ -119,7 +115,7 @@ def run_identifiability(
         if solution is None or solution.status != Status.FAILED:
             progress.begin_stage("computing the Fisher information")
             judged = partial(fisher.identifiability, problem, solution, limits=limits)
-            unknown = judged(start="unknown", grasp_std=GRASP_OFFSET_PRIOR_STD)
+            unknown = judged(start="unknown", grasp_std=fisher.GRASP_OFFSET_PRIOR_STD)
             judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)
             information = judged()
             wanted, names = asked.interval_parameters, information.parameter_names

@@ -220,14 +220,13 @@ def write_diagnosis_hdf5(
             problem = result.nominal_model.problem
             group = file.create_group(f"where/{trace.recording}")
             group.attrs["start"] = next(e.grid.start_time for e in problem.episodes if e.name == trace.recording)
-            store_texts(group, {"unknowns": trace.unknown_names})
-            store_texts(group, {"locations": [source.location for source in trace.unknown_groups]})
-            store_texts(group, {"kinds": [source.kind for source in trace.unknown_groups]})
-            store_texts(group, {"units": smoothed_unknown_units(problem.system, trace)})
-            variance = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
+            sources, units = trace.unknown_groups, smoothed_unknown_units(problem.system, trace)
+            store_texts(group, {"unknowns": trace.unknown_names, "units": units})
+            store_texts(group, {"locations": [s.location for s in sources], "kinds": [s.kind for s in sources]})
+            variance = np.array([smoothed.group_variance[source] for source in sources])
             relative = {"mean": trace.posterior_mean, "std": trace.posterior_std, "prior": np.sqrt(variance)}
-            _store(group, {"edges": trace.interval_edges})
-            _store(group, {name: array * trace.reference_std for name, array in relative.items()})
+            absolute = {name: array * trace.reference_std for name, array in relative.items()}
+            _store(group, {"edges": trace.interval_edges, **absolute})
         for force in result.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit

@@ -499,7 +499,8 @@ def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
 
     Poses of arrays have numbers. If arrays of a topic differ in length, a number is not always one point: no names.
     """
-    names, counts = dict[str, str](), Counter(message.source for message in bag.places)
+    names = dict[str, str]()
+    counts = Counter(message.source for message in bag.places)
     arrays = bag.file.topic_names_of_types(_POSE_ARRAY)
     for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]

@@ -54,7 +54,8 @@ def _read_c3d(
     `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
     """
     path = Path(path)
-    digest, found = file_sha256(path), _markers(path)
+    digest = file_sha256(path)
+    found = _markers(path)
     own = {"points": found.unit} if found.unit else {}
     marked = found.names, found.t, found.position
     group = PointGroup("points", *marked, None, point_sensor_name, point_frame, None, "nominal")
