@@ -135,7 +135,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         text, rest = f"its rms error is {sizes[0]} on held-out recordings", f"On fitted ones it is {sizes[1]}.{guess}"
         if not result["fit"]["explains"]:
             text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
-            yield f"{text} Noise alone gives {sizes[2]}.{guess}"
+            why = ", mostly because errors of the torques carry the arm away" * is_by_torques
+            yield f"{text} Noise alone gives {sizes[2]}{why}.{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{group} shows a gap: {text}, over twice the {sizes[2]} that noise alone gives. {advice} {rest}"
@@ -232,7 +233,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    said = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    said = f"{len(found)} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
@@ -565,7 +566,8 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
     yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
-        names = [own["name"] for own in result["frames"] if own["reason"].partition(":")[0] == why]
-        yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."
+        of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
+        first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)
+        yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])

@@ -333,8 +333,9 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     found = [result.get("model", result)["parameters"] for result in results]
     runs = dict(zip(labels, map(str, folders), strict=True))
     parameters = _overlaid_parameters(labels, found)
+    first, second = map(_settings, folders)
     told = {"format": "yid-overlay/1", "runs": runs, "parameters": parameters, "channels": channels}
-    first = _settings(folders[0])
+    told["model_difference"] = "" if first is None else _difference(first, second)
     settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
