@@ -209,7 +209,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
     assert "No set of up to three changes makes it possible to find all parameters." in lines
-    assert "None of 1 parameters can be found" in lines[0]
+    assert "0 of 1 parameters can be found" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     assert "The fewest changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)
 

@@ -281,7 +281,8 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     problem = _on(last, without).with_free_parameters_without_recompiling(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
-        what = f"the fit failed: {outcome.message}"
         allowed, hint = "recordings of this setup without effects", "remove recordings of other setups from this list"
-        raise SolverError(what, where="recordings.without_effect", allowed=allowed, hint=hint)
+        raise SolverError(
+            f"the fit failed: {outcome.message}", where="recordings.without_effect", allowed=allowed, hint=hint
+        )
     return {name: problem.unknowns.named_values(outcome.x)[name] for name in shared}

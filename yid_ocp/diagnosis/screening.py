@@ -240,8 +240,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     """Amplitudes after a step from neutral."""
-    named = zip(effect.amplitude_parameter_names, map(float, step), strict=True)
-    return {name: effect.neutral_values[name] + moved for name, moved in named}
+    return {n: effect.neutral_values[n] + float(x) for n, x in zip(effect.amplitude_parameter_names, step, strict=True)}
 
 
 @dataclass(frozen=True)

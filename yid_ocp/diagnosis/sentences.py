@@ -207,18 +207,16 @@ def _causes(result: DiagnosisResult) -> list[str]:
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
     more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set."
-    enough = f"no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}"
-    if result.untried and not result.single_effect_models:
-        enough = "the time limit ended the search before any effect was tried."
     reasons = {
-        "none": f"{none} {enough}",
+        "none": f"{none} no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}",
         "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
         "stand_in": f"{none} {size}{apart}. {either}.",
     }
     laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
     alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
     alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    return [*text, reasons.get(result.unknown_reason, ""), alone * bool(laws), _several_places(result)]
+    reason = reasons.get(result.unknown_reason, "") if result.single_effect_models or not result.untried else ""
+    return [*text, reason, alone * bool(laws), _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:
@@ -297,10 +295,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
-        changed = (
-            "Changed since the earlier runs, by more than the ± (without the errors from links and time step, which "
-        )
-        changed += "equal models share): "
+        changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
         end = ". If nothing was altered on purpose, find the cause before you use the values."
@@ -321,8 +316,8 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             continue
         errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")
-        before = swapped.effects_added.rmse_by_unit
-        ratios = [min(pair) / max(before[unit]) for unit, pair in part.rmse_by_unit.items() if unit in before]
+        other = parts["with"].rmse_by_unit
+        ratios = [min(pair) / max(other[unit]) for unit, pair in part.rmse_by_unit.items() if unit in other]
         if how == "without" and min(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO:
             worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
             text.append(f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup.")

@@ -362,11 +362,9 @@ def smooth_unknown_forces_and_biases(
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
-        less = [
-            replace(e, measurements=measurements_minus_sensor_error_estimates(e.measurements, result.predicted_outputs))
-            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
-        ]
-        problem = problem.with_episodes(less, ())
+        pairs = zip(problem.episodes, evaluation.episode_predictions, strict=True)
+        less = ((e, measurements_minus_sensor_error_estimates(e.measurements, p.predicted_outputs)) for e, p in pairs)
+        problem = problem.with_episodes([replace(e, measurements=own) for e, own in less], ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -509,9 +507,7 @@ def smoothed_unknown_significance_mask(trace: SmoothedDisturbances, columns: Seq
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
 
 
-def _windows(
-    smoothed: SmoothedUnknownsResult, sources: Sequence[SmoothedUnknownGroup]
-) -> tuple[tuple[float, float], ...]:
+def _windows(smoothed: SmoothedUnknownsResult, sources: _Groups) -> tuple[tuple[float, float], ...]:
     spans: list[tuple[float, float]] = []
     for trace in smoothed.smoothed_unknowns:
         own = [i for i, source in enumerate(trace.unknown_groups) if source in sources]

@@ -124,16 +124,14 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"The first answer is true in {right['count']} of {right['of']} cases whose effect was detected (a gap)."]
-    said *= bool(right["of"])
+    said = [f"The first answer is true in {right['count']} of {right['of']} detected gaps."] * bool(right["of"])
     if alarms["of"]:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
-    if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
+    stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
+    if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
         do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
-        do = f"{do}: {near} of {len(stated)} are in the 95 % interval of the true share"
-        few = sum(own["of"] for own in stated) < _MIN_STATED_PROBABILITIES
-        said.append(f"Stated probabilities {'are too few to be compared with the outcomes' if few else do}.")
+        said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
     said.append(f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}').")
     if result.get("not_judged"):
         said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
@@ -426,8 +424,8 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
     yield SummaryStatement(names if differing else none, "verdict")
     yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
-    means = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
-    yield f"The models differ (model.{section}), {means}." if (section := result.get("model_difference")) else ""
+    said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
+    yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
     where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"

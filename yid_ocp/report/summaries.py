@@ -240,6 +240,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryStatement(f"{failed}{'At the initial values, ' * is_initial}{said}.", "conclusion")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield "unknown: the ± is infinite. open: any value is possible." if any("unknown" in row for row in rows) else ""
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
@@ -359,10 +360,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
     count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
-    said = (
-        f"A recording of this motion would determine {count} to within 10 % of their value: {names}." if found else ""
-    )
-    yield f"{said or 'No parameter would be known to within 10 %.'} The table has the expected ±."
+    said = f"A recording of this motion would determine {count} to within 10 % of their value: {names}."
+    yield f"{said if found else 'No parameter would be known to within 10 %.'} The table has the expected ±."
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -399,7 +398,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["recordings"]:
         ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
     if issues or warnings:
-        ended = f"A run is possible, but first read the {'issues' if issues else 'warnings'} below."
+        ended = (
+            f"A run is possible, but before you use its values, read the {'issues' if issues else 'warnings'} below."
+        )
     yield SummaryStatement(ended, "conclusion")
     yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
@@ -470,7 +471,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
     text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
-    every = "The readings react to every free parameter. `yid-ocp identifiability` shows which can be found together."
+    every = "Every free parameter changes a reading. `yid-ocp identifiability` shows which can be found together."
     yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
@@ -520,12 +521,8 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        if seen is None or not rows:
-            sight = ""
-        elif len(seen) == len(rows):
-            sight = "all"
-        else:
-            sight = _row_names_text(seen) or "none"
+        sight = "" if seen is None or not rows else _row_names_text(seen) or "none"
+        sight = "all" if sight and len(seen) == len(rows) else sight
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])

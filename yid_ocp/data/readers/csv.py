@@ -310,9 +310,9 @@ def _read_table(
     raise_data_error_unless(len(table), "the table has no rows below its header", str(path), allowed, hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:
-        first, why = next(iter(bad.items()))
+        at, why = next(iter(bad.items()))
         what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers. In the first of them, {why}"
-        where = f"{path}, line {first}" + (" and later lines" if len(bad) > 1 else "")
+        where = f"{path}, line {at}" + (" and later lines" if len(bad) > 1 else "")
         hint = "leave a column of text out, as in --columns NAME=skip, or set the delimiter, as in --delimiter ';'"
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
