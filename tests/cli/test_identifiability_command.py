@@ -75,13 +75,11 @@ def test_judged_at_the_initial_values_without_solving(carried_out, repository):
     assert {entry["value"] for entry in done.result["parameters"].values()} == {100.0}
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--intervals", "spring_1.stifness"), "did you mean 'spring_1.stiffness'?"),
-        (("--set", "model.arms.passive_joints=[spring_1, spring_9]"), "there is no joint 'spring_9'"),
-    ],
-)
+NOT_THERE = {("--intervals", "spring_1.stifness"): "did you mean 'spring_1.stiffness'?"}
+NOT_THERE["--set", "model.arms.passive_joints=[spring_1, spring_9]"] = "there is no joint 'spring_9'"
+
+
+@pytest.mark.parametrize(("options", "said"), NOT_THERE.items())
 def test_names_that_are_not_there_are_refused(printed, repository, tmp_path, left_nothing, options, said):
     file = repository / "configs" / "springs_series_ends.yaml"
     assert said in printed("identifiability", file, "--out", tmp_path / "run", *options, code=2)

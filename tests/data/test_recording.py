@@ -170,6 +170,7 @@ def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
         validated_recording(make())
     assert "recording '" in caught.value.where
     assert case not in ("degrees", "millimetres") or case in caught.value.hint
+    assert case != "degrees asked for" or "add position_command=deg to --units" in caught.value.hint
     if case != "NaN effort":
         with pytest.raises(DataError, match=message):
             write_recording(make(), tmp_path / "run.h5")

@@ -424,7 +424,6 @@ def _trace(model: ResidualStateSpaceModel, done: _Smoothed, state: _State) -> Sm
 def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
     """r'r without and with the unknowns, degrees of freedom of the unknowns, and the number of samples."""
     before = after = taken = 0.0
-    samples = 0
     bare, full = np.append(1.0, -plain.shift), np.append(1.0, -state.shift)
     for model, done in zip(models, state.recordings, strict=True):
         own = np.array([variance[s] for s in model.unknown_groups])
@@ -433,8 +432,7 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
             first, left = interval.negative_residual_jacobian @ bare, smoothed @ full
             before += float(first @ first + bare @ interval.unreachable_products @ bare)
             after += float(left @ left + full @ interval.unreachable_products @ full)
-            samples += interval.sample_count
-    return before, after, taken, samples
+    return before, after, taken, sum(interval.sample_count for model in models for interval in model.intervals)
 
 
 def _alternatives(

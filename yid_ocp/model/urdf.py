@@ -211,7 +211,7 @@ def _parsed(file: Path) -> SimpleNamespace:
     except ModelError:
         raise
     except Exception as error:  # a malformed file raises many kinds
-        reason = f"a link or joint has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
+        reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
         allowed, hint = "a URDF file with links and joints", f"run `check_urdf {file}`, or export the file again"
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 

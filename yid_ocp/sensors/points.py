@@ -63,8 +63,9 @@ def _points(
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
         what = f"no recorded point ({', '.join(wanted)}) has the name of a frame of the model"
-        set_frame = f"frame_by_recorded_name: {{{', '.join(wanted[:1])}: FRAME}}"
-        hint = f"set sensors.{group.name}.{set_frame}, or sensors.{group.name}.use: false"
+        hint = (
+            f"under sensors.{group.name}, set frame_by_recorded_name: {{{', '.join(wanted[:1])}: FRAME}} or use: false"
+        )
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
