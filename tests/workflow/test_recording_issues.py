@@ -136,8 +136,8 @@ def test_times_since_1970_give_the_same_problem(damaged):
 )
 def test_points_listed_by_name_that_are_not_there_are_an_error(repository, setting, name):
     file = repository / "configs" / "single_arm_vision.yaml"
-    quick = ("problem.use_compiler=false", "model.object.links=1")
-    run = load_config(file, [f"sensors.points_camera={{{setting}}}", *quick])
+    settings = [f"sensors.points_camera={{{setting}}}", "problem.use_compiler=false", "model.object.links=1"]
+    run = load_config(file, settings)
     with pytest.raises(DataError, match=name) as caught:
         build_problem(run)
     assert "did you mean 'w_T" in str(caught.value)

@@ -307,6 +307,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
         text += [small * (not since.is_baseline_explained)]
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
+    other = {} if swapped is None else swapped.effects_added.rmse_by_unit
     for how, part in parts.items():
         names = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
         made = f"Recordings made {how} the effects ({names})"
@@ -316,8 +317,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             continue
         errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")
-        other = parts["with"].rmse_by_unit
-        ratios = [min(pair) / max(other[unit]) for unit, pair in part.rmse_by_unit.items() if unit in other]
+        ratios = [min(pair) / max(other[u]) for u, pair in part.rmse_by_unit.items() if u in other]
         if how == "without" and min(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO:
             worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
             text.append(f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup.")

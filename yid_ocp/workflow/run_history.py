@@ -114,8 +114,8 @@ def read_result_file(file: Path) -> dict[str, Any]:
     """Read the result.json of any command. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
         hint, allowed = "give the run folder that `solve` or `diagnose` printed", "a run folder with result.json"
-        fault = "has no finished run" if file.parent.is_dir() else "is not an existing folder"
-        raise DataError(f"{file.parent} {fault}", where=str(file), allowed=allowed, hint=hint)
+        what = f"{file.parent} {'has no finished run' if file.parent.is_dir() else 'is not an existing folder'}"
+        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
         what, hint = "the file does not have the result of a run", "repeat the command that made the folder"
