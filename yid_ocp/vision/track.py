@@ -213,9 +213,8 @@ class SingleFrameTracker:
         rng = np.random.default_rng(options.seed)
         source, clock = self.sequence.source, options.clock_offset_search
         if failed and not glimpses and (clock.search_half_width > 0 or not options.calibration.fix_pose):
-            first = failed[0]
-            what = f"none of {len(failed)} frames can be used to calibrate the camera. In the first, {first.what}"
-            raise DataError(what, where=first.where, allowed=first.allowed, hint=first.hint)
+            what = f"none of {len(failed)} frames can be used to calibrate the camera. In the first, {failed[0].what}"
+            raise DataError(what, where=failed[0].where, allowed=failed[0].allowed, hint=failed[0].hint)
         return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
