@@ -134,14 +134,11 @@ def test_the_part_that_a_direction_explains_does_not_depend_on_its_length(size):
     np.testing.assert_allclose(module._orthogonal_part(columns, explained), [[0, 0], [0, 1], [0, -1]], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("nuisances", "words"),
-    [
-        ((SLOPE,), "another initial state"),
-        ((GRASP,), "another position of the grasp"),
-        ((GRASP, SLOPE), "another initial state and position of the grasp"),
-    ],
-)
+HIDING = {(SLOPE,): "another initial state", (GRASP,): "another position of the grasp"}
+HIDING |= {(GRASP, SLOPE): "another initial state and position of the grasp"}
+
+
+@pytest.mark.parametrize(("nuisances", "words"), HIDING.items())
 def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuisances, words):
     start = {"a": 2.0, **dict.fromkeys(nuisances, 0.0)}
     wide = Formula(lambda x: [30 * (x["a"] / 2 - 1) + 5 * x[name] for name in nuisances], start, bounds=FREE)
@@ -158,6 +155,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
     assert "cannot distinguish a change of a by +10 % and b by +10 % from another initial state. Begin rec" in said
+    assert "set problem.initial_state: equilibrium, and leave out --unknown-start" in said
 
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):

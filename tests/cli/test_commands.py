@@ -309,15 +309,12 @@ def test_inspect_without_recordings(carried_out, written, urdf_folder):
     assert (result["equations"]["unknowns"], result["equations"]["jacobian_nonzeros"]) == (2, 4)
 
 
-@pytest.mark.parametrize(
-    ("entry", "said"),
-    [
-        ("dle[elbow]", "did you mean 'del[elbow]'?"),
-        ("del[elbow], q1[elbo]", "did you mean 'q1[elbow]'?"),
-        ("elbow.mas", "did you mean 'elbow.mass'?"),
-        ("del[elbow], h, h", "ROW (an equation), or ROW, COLUMN (its derivative"),
-    ],
-)
+MEANT = {"dle[elbow]": "del[elbow]", "del[elbow], q1[elbo]": "q1[elbow]", "elbow.mas": "elbow.mass"}
+WRONG_ENTRIES = {entry: f"did you mean '{name}'?" for entry, name in MEANT.items()}
+WRONG_ENTRIES["del[elbow], h, h"] = "ROW (an equation), or ROW, COLUMN (its derivative"
+
+
+@pytest.mark.parametrize(("entry", "said"), WRONG_ENTRIES.items())
 def test_a_wrong_entry_leaves_nothing_behind(printed, pendulum, tmp_path, entry, said):
     assert said in printed("inspect", pendulum, "--out", "i", "--entry", entry, "--export", "eq", code=2)
     assert not (tmp_path / "i").exists()

@@ -181,6 +181,7 @@ def compared():
     errors = [{"points.tip": (error, "m")} for error in (0.02, 0.01)]
     better = _PredictionErrors(("bare (without)",), *errors)
     for name, other in {"worse": _PredictionErrors(("a", "b", "c"), *reversed(errors)),
+                        "better": _PredictionErrors(("a",), *({"p": (e, "m")} for e in (0.003, 0.001))),
                         "failed": _PredictionErrors(("a",), {}, {}, "it diverges")}.items():  # fmt: skip
         yield f"{name} with effects", finding(counterfactual=CounterfactualPredictionErrors(better, other))
 

@@ -179,13 +179,11 @@ def test_a_straight_line_is_read_at_the_ends_of_its_range():
     assert found.final_criterion > found.initial_criterion
 
 
-@pytest.mark.parametrize(
-    ("limits", "apart"),
-    [
-        ((straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 0.8),  # the places are no more than 0.8 apart
-        ((lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2 * 0.6 / 2**0.5),  # in a circle of radius 0.6
-    ],
-)
+KEPT = [((straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 0.8)]  # the places are no more than 0.8 apart
+KEPT += [((lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2 * 0.6 / 2**0.5)]  # in a circle of radius 0.6
+
+
+@pytest.mark.parametrize(("limits", "apart"), KEPT)
 def test_a_limit_is_kept_on_the_way_and_used_up_in_the_end(limits, apart):
     for rounds in (1, 2, 50):
         found = searched(limits, rounds)
@@ -260,10 +258,16 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
         ConfigError, ("determines shoulder.damping", "a parameter that changes readings", "readings by 0 std")
     ):
         plan_informative_motion(blind, replace(OPTIONS, parameters_to_identify=("shoulder.damping",)))
-    options = SimpleNamespace(clamp_pose_point_names="a")
-    clamped = SimpleNamespace(system=problem.system, episodes=[None], options=options)
-    with pytest.raises(ConfigError, match=r"a plan cannot move clamps(.|\n)*try: let a robot"):
-        SplineMotionExperiment.from_options(clamped, {}, OPTIONS)
+    servos = SimpleNamespace(servos=(1,), driven=(1,))
+    words = {
+        "a": r"a plan cannot move clamps(.|\n)*try: let a robot",
+        "": r"of servos(.|\n)*goal(.|\n)*leave servo_\* out",
+    }
+    for clamps, said in words.items():
+        options = SimpleNamespace(clamp_pose_point_names=clamps)
+        of = SimpleNamespace(system=problem.system if clamps else servos, episodes=[None], options=options)
+        with pytest.raises(ConfigError, match=said):
+            SplineMotionExperiment.from_options(of, {}, OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_a_plan_that_fails_says_so(config, carried_out):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["plan.parameter_run_folder=nowhere"], ("no finished run", "nowhere", "plan.parameter_run_folder")),
+        (["plan.parameter_run_folder=nowhere"], ("nowhere is not an existing folder", "plan.parameter_run_folder")),
         (["plan.goal=throw"], ("plan.goal", "place, path, box")),
         (["plan.limits.velocity_fraction=2"], ("plan.limits.velocity_fraction", "up to 1")),
         (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?", "--set plan.point")),

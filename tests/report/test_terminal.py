@@ -141,6 +141,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
         (0.003, 0.002, GOOD, None),
         (0.003, 0.0027, GOOD, "points shows no gap: its rms error is 3 mm on held-out recordings, at most twice the"),
         (0.003, 0.002, BAD, "is 3 mm on held-out and 1.8 mm on fitted recordings. Noise alone gives 2 mm. The guess"),
+        (0.003, 0.03, BAD, "gives 30 mm, mostly because errors of the torques carry the arm away. The guess"),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
@@ -209,7 +210,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
     assert "No set of up to three changes makes it possible to find all parameters." in lines
-    assert "None of 1 parameters can be found" in lines[0]
+    assert "0 of 1 parameters can be found" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     assert "The fewest changes with which all parameters can be found: a weld." in told("yid-identifiability/1", result)
 
@@ -217,10 +218,8 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
 def test_a_simulation_that_failed_and_one_that_did_not():
     done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5}
     failed, good = (told("yid-simulate/1", own)[0] for own in ({"status": "failed", "message": "step 3"}, done))
-    assert (failed[:34], good[:41]) == (
-        "The simulation failed: step 3. If ",
-        "The file recording.h5 has 0.5 s of simula",
-    )
+    assert failed.startswith("The simulation failed: step 3. If ")
+    assert good.startswith("The file recording.h5 has 0.5 s of simula")
 
 
 def test_blocks_on_a_terminal():
@@ -276,10 +275,7 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
         (["j1.damping", "tip.mass", "j3.damping", "j2.damping", "j5.damping"], "j1..3.damping, tip.mass, j5.damping"),
         ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9..11, w1.x9..11"),
         (["j01.c", "j02.c", "j03.c", ""], "j01.c, j02.c, j03.c, "),
-        (
-            [f"{chr(97 + i)}.gain" for i in range(20)],
-            ", ".join(f"{chr(97 + i)}.gain" for i in range(12)) + " and 8 more",
-        ),
+        ([f"{c}.gain" for c in "abcdefghijklmnopqrst"], ", ".join(f"{c}.gain" for c in "abcdefghijkl") + " and 8 more"),
         ([], ""),
     ],
 )

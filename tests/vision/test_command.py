@@ -94,7 +94,7 @@ def test_wrong_input_is_said_and_leaves_nothing(printed, config, tmp_path, setti
 def test_without_a_good_frame_the_reasons_and_pictures_are_left(carried_out, config, tmp_path):
     done = carried_out("track", config, settings=("track.point_cloud_unit=mm", PLAIN), codes=(2,))
     assert "no frame could be used" in done.err
-    assert str(done.folder) in done.err
+    assert f"reasons, and pictures of readable frames, are in {done.folder}" in done.err
     assert "no frame could" in done.result["refused"]
     assert all("no point lies in the region" in frame["reason"] for frame in done.result["frames"])
     assert len(list((done.folder / "pictures").glob("*_cloud.png"))) == 1

@@ -133,7 +133,7 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
     assert np.array_equal(found.point_positions_at_time(found.t[-1] + 5.0), found.point_positions_at_time(found.t[-1]))
 
 
-def unreadable():
+def unreadable(_=0):
     raise DataError("the point cloud cannot be used", hint="")
 
 
@@ -168,28 +168,28 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     for index, reason in enumerate(BAD, start=3):
         assert reports[index]
         assert reason.rstrip(":") in reports[index]
-    duplicate, missing, late = (reports[3 + len(bad) + k] for k in range(3))
-    assert "a duplicate" in duplicate
-    assert "not a number" in missing
-    assert "no joint angles" in late
+    for index, reason in enumerate(("a duplicate", "not a number", "no joint angles"), start=3 + len(bad)):
+        assert reason in reports[index]
     assert sum(found.frame_drop_reason_counts.values()) == len(bad) + 3
 
 
-@pytest.mark.parametrize(
-    ("scale", "options", "message"),
-    [
-        (1000, TrackOptions(), "metres"),
-        (1, TrackOptions(filters=vision.CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "track.camera_pose"),
-    ],
-)
-def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, message):
+@pytest.mark.parametrize(("scale", "lowest", "message"), [(1000, -9.0, "metres"), (1, 5.0, "track.camera_pose")])
+def test_nothing_but_bad_clouds_is_an_error(system, small, scale, lowest, message):
+    options = TrackOptions(filters=vision.CloudFilterOptions(box_lower=(-9.0, -9.0, lowest)))
     sequence = replace(small.sequence, load_cloud=lambda index: scale * small.clouds[index])
     with pytest.raises(DataError, match="no frame could be used") as caught:
         track_object(SceneDescription(system), small.recording, sequence, options)
     assert message in caught.value.what
-    assert f"In {len(small.clouds)} of {len(small.clouds)} frames, " in caught.value.what  # all for one reason
+    assert f"in {len(small.clouds)} of {len(small.clouds)} frames, " in caught.value.what  # all for one reason
     assert "dimensions contradict the model" not in caught.value.what
     assert caught.value.hint
+    told = SceneDescription(system), small.recording, replace(sequence, load_cloud=unreadable), options
+    tracker = SingleFrameTracker(*told)
+    tracker.arm_surface, tracker.calibration_frames = tracker, (0, 1)
+    with pytest.raises(
+        DataError, match=r"none of 2 frames can be used .* In the first, the point cloud cannot be used"
+    ):
+        tracker._calibration()
 
 
 def test_the_time_of_another_clock(system, small):

@@ -302,6 +302,8 @@ def test_joints_driven_by_torques_have_sharp_friction_and_candidates_are_as_shar
     candidates = make_candidate_effects(build_system(run), [], ["joint_stribeck"])
     stated = EffectSettings(kind="joint_stribeck", location=candidates[0].location, values={"tau_s": 0.1})
     known = build_system(replace(run, model=replace(run.model, effects=(*run.model.effects, stated)))).effects
+    with pytest.raises(ConfigError, match="already has the effect joint_coulomb at every"):
+        make_candidate_effects(build_system(run), [], ["joint_coulomb"])
     dry = [own for own in (*known, *candidates) if own.kind in ("joint_coulomb", "joint_stribeck")]
     assert {effect.sign_smoothing_speed for effect in dry} == {3e-3 if v_s == "3e-3" else 0.02 if file else 1e-3}
 

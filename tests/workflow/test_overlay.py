@@ -30,10 +30,10 @@ def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, printed, tmp_pat
     made = json.loads((tmp_path / "both" / "overlay.json").read_text(), parse_constant=pytest.fail)
     assert list(made["runs"]) == ["free", "fixed"]
     own, other = (json.loads((run / "result.json").read_text()) for run in (first, second))
-    entry = made["parameters"][fixed]
+    entry, difference = made["parameters"][fixed], made["model_difference"]
     assert entry["values"]["free"]["value"] == own["parameters"][fixed]["value"]
     moved = other["parameters"][fixed]["value"] - own["parameters"][fixed]["value"]
-    assert entry["difference"] == pytest.approx(moved)
+    assert (entry["difference"], difference) == (pytest.approx(moved), "")
     assert entry["difference_in_std"] == pytest.approx(moved / own["parameters"][fixed]["std"])
     held_out = [e for e in made["channels"] if e["held_out"]]
     assert {e["channel"]: e["rmse"]["free"] for e in held_out} == pytest.approx(
@@ -74,6 +74,7 @@ def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
     assert (parameters["k"]["difference"], parameters["k"]["difference_in_std"]) == (None, None)
     channel = {"recording": "r", "channel": "points.p", "unit": "m", "held_out": True, "rmse": {"a": 1.0, "b": 2.0}}
     result = {"format": "yid-overlay/1", "runs": {"a": "a", "b": "b"}, "parameters": parameters}
-    result |= {"channels": [channel | {"difference": 0.5}]}
+    result |= {"channels": [channel | {"difference": 0.5}], "model_difference": "object"}
     lines = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT["yid-overlay/1"](result))
     assert "k          –  2.5 ± 0.1  N m/rad" in lines
+    assert "The models differ (model.object), so a parameter may differ" in " ".join(lines)

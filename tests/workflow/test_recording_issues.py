@@ -12,7 +12,7 @@ from yid_ocp.data.channel_checks import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import _is_modelled, build_problem, data_quality_issues_of_recording
+from yid_ocp.workflow.build_problem import _is_modelled, _once, build_problem, data_quality_issues_of_recording
 
 
 @pytest.fixture
@@ -116,6 +116,9 @@ def test_the_same_data_twice_count_once(damaged):
     twice = build_problem(load_config(file, ["recordings.estimate=[damaged.h5, again/damaged.h5]"]))
     assert [episode.name for episode in twice.episodes] == [episode.name for episode in once.episodes]
     assert [doubt.cause for doubt in twice.options.data_issues] == ["same_data"]
+    one, issues = read_recording(file.parent / "damaged.h5"), list[Issue]()
+    assert _once(load_config(file), [], [one, replace(one, name="copy")], issues) == ([], [one])
+    assert f"samples of copy equal samples of {one.name} to the last digit" in issues[0].what
     with pytest.raises(DataError, match=r"(?s)listed for estimation and as held out.*leave out damaged_1 or damaged"):
         build_problem(load_config(file, ["recordings.held_out=[again/damaged.h5]"]))
 
@@ -133,8 +136,8 @@ def test_times_since_1970_give_the_same_problem(damaged):
 )
 def test_points_listed_by_name_that_are_not_there_are_an_error(repository, setting, name):
     file = repository / "configs" / "single_arm_vision.yaml"
-    quick = ("problem.use_compiler=false", "model.object.links=1")
-    run = load_config(file, [f"sensors.points_camera={{{setting}}}", *quick])
+    settings = [f"sensors.points_camera={{{setting}}}", "problem.use_compiler=false", "model.object.links=1"]
+    run = load_config(file, settings)
     with pytest.raises(DataError, match=name) as caught:
         build_problem(run)
     assert "did you mean 'w_T" in str(caught.value)

@@ -389,7 +389,7 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    rest = "Begin recordings at rest, and set problem.initial_state: equilibrium"
+    rest = "Begin recordings at rest, set problem.initial_state: equilibrium, and leave out --unknown-start"
     places = {name.partition("@")[2].rpartition(".")[0] for name in others if name.startswith(_GRASP_OFFSET_PREFIX)}
     grasp = f"Measure the position of grasp {', '.join(sorted(places))}, and leave out --unknown-grasp"
     start = f"another initial state. {rest}", "start."

@@ -148,7 +148,7 @@ def _few_samples(recording: Recording) -> Iterator[Issue]:
         count, least = len(group.t), QUALITY_LIMITS.min_samples
         if count < least:
             what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
-            advice = "check whether the file is complete. If it is, record some seconds of motion"
+            advice = f"check whether the file is complete. If it is, record until {group.name} has {least} samples"
             yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
 
 

@@ -70,6 +70,8 @@ def make_candidate_effects(
         if not found:
             missing = ", ".join(sorted(cls.required_sensors - sensors))
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
+            if any(effect.kind == kind for effect in system.effects):
+                what = f"the model already has the effect {kind} at every possible location"
             allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), f"remove {kind} from this list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]

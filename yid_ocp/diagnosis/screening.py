@@ -233,15 +233,13 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
     p_value = null_test.chi2_p_value(statistic, len(step))
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
-    values = _values(effect, step) | signature.shape_values
-    changes = tuple((signature.base_changes @ step).tolist())
-    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, changes)
+    values, changes = _values(effect, step) | signature.shape_values, (signature.base_changes @ step).tolist()
+    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, tuple(changes))
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     """Amplitudes after a step from neutral."""
-    named = zip(effect.amplitude_parameter_names, map(float, step), strict=True)
-    return {name: effect.neutral_values[name] + moved for name, moved in named}
+    return {n: effect.neutral_values[n] + float(x) for n, x in zip(effect.amplitude_parameter_names, step, strict=True)}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_NAMED = 5  # number of named parameters, the largest changes first, and of named events
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
+_FAULTY_RECORDING_ERROR_RATIO = 3  # error on a reference recording by any model, over that on the other recordings
 _RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
@@ -214,7 +215,8 @@ def _causes(result: DiagnosisResult) -> list[str]:
     laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
     alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
     alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    return [*text, reasons.get(result.unknown_reason, ""), alone * bool(laws), _several_places(result)]
+    reason = reasons.get(result.unknown_reason, "") if result.single_effect_models or not result.untried else ""
+    return [*text, reason, alone * bool(laws), _several_places(result)]
 
 
 def _several_places(result: DiagnosisResult) -> str:
@@ -293,10 +295,11 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
             now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
             moved.append(f"{own.name} from {before} to {now} {own.unit}")
+        changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
         same = "No parameter differs significantly from the baseline (the earlier runs)."
         rivals = result.confusable_parameter_changes
         end = ". If nothing was altered on purpose, find the cause before you use the values."
-        text.append(_listed("Changed since the earlier runs, by more than the ±: ", moved, end) or same * (not rivals))
+        text.append(_listed(changed, moved, end) or same * (not rivals))
         text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
         p = since.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
@@ -304,6 +307,7 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
         text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
         text += [small * (not since.is_baseline_explained)]
     parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
+    other = {} if swapped is None else swapped.effects_added.rmse_by_unit
     for how, part in parts.items():
         names = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
         made = f"Recordings made {how} the effects ({names})"
@@ -313,6 +317,11 @@ def _earlier_runs(result: DiagnosisResult) -> list[str]:
             continue
         errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
         text.append(f"{made} are predicted with an error of {errors}.")
-        if not part.is_improved_by_counterfactual:
-            text.append(f"The diagnosis does not lower the error on {names}, so another cause may be the true one.")
+        ratios = [min(pair) / max(other[u]) for u, pair in part.rmse_by_unit.items() if u in other]
+        if how == "without" and min(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO:
+            worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
+            text.append(f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup.")
+        elif not part.is_improved_by_counterfactual:
+            same = " and ".join(unit for unit, (first, then) in part.rmse_by_unit.items() if then > 0.999 * first)
+            text.append(f"The diagnosis does not lower the error in {same} on {names}, so it may be wrong.")
     return text

@@ -371,11 +371,9 @@ def smooth_unknown_forces_and_biases(
         problem = problem_with_sensor_noise_only(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     if any(episode.has_biases_treated_as_noise for episode in problem.episodes):
-        less = [
-            replace(e, measurements=measurements_minus_sensor_error_estimates(e.measurements, result.predicted_outputs))
-            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
-        ]
-        problem = problem.with_episodes(less, ())
+        pairs = zip(problem.episodes, evaluation.episode_predictions, strict=True)
+        less = ((e, measurements_minus_sensor_error_estimates(e.measurements, p.predicted_outputs)) for e, p in pairs)
+        problem = problem.with_episodes([replace(e, measurements=own) for e, own in less], ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
@@ -435,7 +433,6 @@ def _trace(model: ResidualStateSpaceModel, done: _Smoothed, state: _State) -> Sm
 def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
     """r'r without and with the unknowns, degrees of freedom of the unknowns, and the number of samples."""
     before = after = taken = 0.0
-    samples = 0
     bare, full = np.append(1.0, -plain.shift), np.append(1.0, -state.shift)
     for model, done in zip(models, state.recordings, strict=True):
         own = np.array([variance[s] for s in model.unknown_groups])
@@ -444,8 +441,7 @@ def _explained(models: _Models, variance: _Variances, plain: _State, state: _Sta
             first, left = interval.negative_residual_jacobian @ bare, smoothed @ full
             before += float(first @ first + bare @ interval.unreachable_products @ bare)
             after += float(left @ left + full @ interval.unreachable_products @ full)
-            samples += interval.sample_count
-    return before, after, taken, samples
+    return before, after, taken, sum(interval.sample_count for model in models for interval in model.intervals)
 
 
 def _alternatives(
@@ -518,9 +514,7 @@ def smoothed_unknown_significance_mask(trace: SmoothedDisturbances, columns: Seq
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > SIGNIFICANT_Z * std)
 
 
-def _windows(
-    smoothed: SmoothedUnknownsResult, sources: Sequence[SmoothedUnknownGroup]
-) -> tuple[tuple[float, float], ...]:
+def _windows(smoothed: SmoothedUnknownsResult, sources: _Groups) -> tuple[tuple[float, float], ...]:
     spans: list[tuple[float, float]] = []
     for trace in smoothed.smoothed_unknowns:
         own = [i for i, source in enumerate(trace.unknown_groups) if source in sources]

@@ -67,9 +67,9 @@ class SplineMotionExperiment:
                 said, hint = "a plan cannot move clamps that follow recorded points", "let a robot hold the object"
             raise ConfigError(said, where="plan", allowed="robot arms that move, without clamps", hint=hint)
         if system.servos:
-            what = "motions of servos cannot be planned, because their commands differ from their motion"
-            hint = "set model.arms.mode: prescribed for the plan, in which the arms move as planned"
-            raise ConfigError(what, where="model.arms.mode", allowed="driven, prescribed", hint=hint)
+            what = "an informative motion of servos cannot be planned, because their commands differ from their motion"
+            hint = "set model.arms.mode: prescribed for the plan, and leave servo_* out of parameters"
+            raise ConfigError(what, where="plan.goal", allowed="arms whose mode is driven or prescribed", hint=hint)
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)
         known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)

@@ -232,9 +232,11 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     """Locate a sensor's samples between rollout nodes. Raises `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
-        group, allowed = data.sensor.group_name, f"a number above 0 [{data.sensor.unit}]"
-        what, hint = f"a noise standard deviation of {group} is zero or missing", f"set sensors.{group}.std: NUMBER"
-        raise DataError(what, where=f"recording '{where}': {group}", allowed=allowed, hint=hint)
+        key, allowed = data.sensor.group_name, f"numbers above 0 [{data.sensor.unit}]"
+        what = f"{np.sum(seen & ~(data.std > 0))} of {np.sum(seen)} noise stds of {key} are zero or missing"
+        raise DataError(
+            what, where=f"recording '{where}': {key}", allowed=allowed, hint=f"set sensors.{key}.std: NUMBER"
+        )
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.preceding_node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)

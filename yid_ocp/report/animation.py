@@ -310,9 +310,9 @@ def measured_motion_animation(
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:
     """Return configurations (F, n) at times t (F,), with the recorded joint angles."""
     q, joints = told._q_at(t), recording.joints
-    for name, column in () if joints is None else zip(joints.names, joints.position.T, strict=True):
-        if name in told.system.mechanism.joint_names:
-            assert joints is not None
+    if joints is not None:
+        for name in {*joints.names} & {*told.system.mechanism.joint_names}:
+            column = joints.position[:, joints.names.index(name)]
             q[:, told.system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
     return q
 

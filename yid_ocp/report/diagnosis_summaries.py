@@ -34,6 +34,7 @@ _MAX_CANDIDATES = 15  # largest number of listed candidates; result.json has all
 _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
 """Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
+_MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -123,10 +124,11 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"The first answer is true in {right['count']} of {right['of']} cases with a gap."] * bool(right["of"])
+    said = [f"The first answer is true in {right['count']} of {right['of']} detected gaps."] * bool(right["of"])
     if alarms["of"]:
         said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
-    if stated := [own for own in result["calibration"]["probabilities"] if own["of"]]:
+    stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
+    if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
         do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
         said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
@@ -426,6 +428,8 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
     yield SummaryStatement(names if differing else none, "verdict")
     yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
+    said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
+    yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
     where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"

@@ -198,10 +198,8 @@ def time_plots_figure(
     margin = {"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN}
     height = inner + _TOP_MARGIN + _BOTTOM_MARGIN
     legend, around = {**_LAYOUT["legend"], "y": 1 + 22 / inner}, {"shapes": shapes, "annotations": titles}
-    return {
-        "data": traces,
-        "layout": {**_LAYOUT, **axes, **around, "height": height, "margin": margin, "legend": legend},
-    }
+    layout = {**_LAYOUT, **axes, **around, "height": height, "margin": margin, "legend": legend}
+    return {"data": traces, "layout": layout}
 
 
 def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:

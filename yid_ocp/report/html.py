@@ -23,8 +23,7 @@ from yid_ocp.report.terminal import CodeBlock, SummaryTable
 from yid_ocp.solvers.base import Status
 
 log = logging.getLogger(__name__)
-_SHARED_SCRIPT_LEVELS = 2
-"""Number of folders above a page that are searched for a shared script. A batch is two above its runs' pages."""
+_SHARED_SCRIPT_LEVELS = 2  # number of folders above a page that are searched for a shared script, as of a batch
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
 _STATE_WORDS = {*VERDICT_TABLE_TEXTS.values(), *(status.value for status in Status)}  # in a column of numbers
 _NUMBER = re.compile(
@@ -38,7 +37,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     The page works offline: it contains Plotly's script, unless `write_shared_plotly_script` has written one to the
     page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page is written.
     """
-    if not _installed():
+    if util.find_spec("plotly") is None:
         log.warning("no report is written, because plotly is missing: pip install '.[report]' in the project's clone")
         return False
     import jinja2
@@ -63,14 +62,10 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 def write_shared_plotly_script(folder: Path) -> None:
     """Write Plotly's script to a folder, for pages in it and up to two levels below. Raises `OutputError`."""
-    if _installed():
+    if util.find_spec("plotly") is not None:
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):
             write_text(folder / name, text)
-
-
-def _installed() -> bool:
-    return util.find_spec("plotly") is not None
 
 
 @functools.cache

@@ -27,15 +27,10 @@ def draw_blind_validation_figures(folder: Path, result: Mapping[str, Any]) -> li
     """
     from matplotlib.figure import Figure
 
-    lines = {
-        "gap": ("gap seen", 0.95),
-        "first": ("kind and place first", 1.0),
-        "right": ("named first, or in a set of at most three", 1.05),
-    }
-    sizes = {
-        label: {shift * float(size): own[key] for size, own in result["detection_intervals"].items()}
-        for key, (label, shift) in lines.items()
-    }
+    lines = {"gap": ("gap seen", 0.95), "first": ("kind and place first", 1.0)}
+    lines["right"] = ("named first, or in a set of at most three", 1.05)
+    rates = {float(size): own for size, own in result["detection_intervals"].items()}
+    sizes = {label: {shift * size: rates[size][key] for size in rates} for key, (label, shift) in lines.items()}
     figure = Figure(figsize=(5.6, 4.0), layout="constrained")
     axes = figure.subplots()
     _draw_rates(axes, sizes, "lower right")
@@ -71,9 +66,7 @@ def draw_blind_validation_figures(folder: Path, result: Mapping[str, Any]) -> li
 
 
 def _draw_rates(
-    axes: Axes,
-    curves: Mapping[str, Mapping[float, Mapping[str, float]]],
-    legend_place: Literal["lower right", "upper left"],
+    axes: Axes, curves: Mapping[str, Mapping[float, Mapping[str, float]]], corner: Literal["lower right", "upper left"]
 ) -> None:
     for label, known in curves.items():
         if known:
@@ -83,7 +76,7 @@ def _draw_rates(
             axes.errorbar(list(known), values, yerr=spread, marker="o", capsize=3, label=label)
     axes.grid(alpha=0.3)
     if any(curves.values()):
-        axes.legend(loc=legend_place)
+        axes.legend(loc=corner)
 
 
 def _save(figure: Figure, path: Path, dpi: int = 120) -> None:

@@ -135,7 +135,8 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         text, rest = f"its rms error is {sizes[0]} on held-out recordings", f"On fitted ones it is {sizes[1]}.{guess}"
         if not result["fit"]["explains"]:
             text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
-            yield f"{text} Noise alone gives {sizes[2]}.{guess}"
+            why = ", mostly because errors of the torques carry the arm away" * is_by_torques
+            yield f"{text} Noise alone gives {sizes[2]}{why}.{guess}"
         elif error > _MAX_NOISE_RATIO * noise:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{group} shows a gap: {text}, over twice the {sizes[2]} that noise alone gives. {advice} {rest}"
@@ -232,13 +233,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
-    said = f"{len(found) or 'None'} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    said = f"{len(found)} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
     yield SummaryStatement(f"{failed}{'At the initial values, ' * is_initial}{said}.", "conclusion")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield "unknown: the ± is infinite. open: any value is possible." if any("unknown" in row for row in rows) else ""
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
@@ -358,10 +360,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
     count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
-    said = (
-        f"A recording of this motion would determine {count} to within 10 % of their value: {names}." if found else ""
-    )
-    yield f"{said or 'No parameter would be known to within 10 %.'} The table has the expected ±."
+    said = f"A recording of this motion would determine {count} to within 10 % of their value: {names}."
+    yield f"{said if found else 'No parameter would be known to within 10 %.'} The table has the expected ±."
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -398,7 +398,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["recordings"]:
         ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
     if issues or warnings:
-        ended = f"A run is possible, but first read the {'issues' if issues else 'warnings'} below."
+        ended = (
+            f"A run is possible, but before you use its values, read the {'issues' if issues else 'warnings'} below."
+        )
     yield SummaryStatement(ended, "conclusion")
     yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
@@ -469,7 +471,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
     text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
-    every = "The readings react to every free parameter. `yid-ocp identifiability` shows which can be found together."
+    every = "Every free parameter changes a reading. `yid-ocp identifiability` shows which can be found together."
     yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
@@ -519,12 +521,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for name in dict.fromkeys([*shown, *result["asked"]]):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        if seen is None or not rows:
-            sight = ""
-        elif len(seen) == len(rows):
-            sight = "all"
-        else:
-            sight = _row_names_text(seen) or "none"
+        sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else _row_names_text(seen) or "none"
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])
@@ -565,7 +562,8 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
     yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
-        names = [own["name"] for own in result["frames"] if own["reason"].partition(":")[0] == why]
-        yield f"{count_with_noun(n, 'image')} not used, because {why} ({abbreviated_names_text(names)})."
+        of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
+        first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)
+        yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])

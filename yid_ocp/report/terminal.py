@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, LIMIT_VIOLATION_RATIO_CAP, mean_sample_rate
-from yid_ocp.display import abbreviated_names_text
+from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
 
@@ -206,7 +206,7 @@ def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
         priors = dict.fromkeys(f"± {known['prior_std']:.2g}" for known in own if known is not None)
         rows.append((joint, *cells, ", ".join(priors)))
     left = len(offsets) - len(shown)
-    rows += [(f"{left} more recordings are in result.json", *("" for _ in shown), "")] if left else []
+    rows += [(f"result.json has {count_with_noun(left, 'more recording')}", *("" for _ in shown), "")] if left else []
     return rows
 
 

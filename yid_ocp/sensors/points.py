@@ -62,8 +62,10 @@ def _points(
             said = unknown_name_error_arguments(frames[point], mechanism.frames, hint)
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
-        what = f"none of the recorded points {', '.join(wanted)} has the name of a frame of the model"
-        hint = f"set sensors.{group.name}.frame_by_recorded_name: {{POINT: FRAME}}, or sensors.{group.name}.use: false"
+        what = f"no recorded point ({', '.join(wanted)}) has the name of a frame of the model"
+        hint = (
+            f"under sensors.{group.name}, set frame_by_recorded_name: {{{', '.join(wanted[:1])}: FRAME}} or use: false"
+        )
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)

@@ -283,7 +283,7 @@ class _Calibrator:
     def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
-            needed = f"the arm is in view in {len(glimpses)} frames, but at least {_MIN_FRAMES} are needed"
+            needed = f"the arm is in view in {len(glimpses)} of {len(frames)} usable frames ({_MIN_FRAMES} are needed)"
             raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late

@@ -205,7 +205,7 @@ def _none_good(
     for frame in frames:
         kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:2]
-    starts = [f"In {len(own)} of {len(frames)} frames, {'for example, ' * (len(set(own)) > 1)}" for own in often]
+    said = [own[0].replace(": ", ", for example: ", 1) if len(set(own)) > 1 else own[0] for own in often]
     cause = _because(sizes, next((reasons[0] for reasons in often), "").startswith(_MISFIT_REASONS))
     hint = "check track.camera_pose, track.point_cloud_unit and track.options.filters"
     of_cause = {
@@ -219,7 +219,8 @@ def _none_good(
     }
     hints = [own for words, own in of_cause.items() if any(words in reasons[0] for reasons in often)]
     hint = _hint(sizes, things, "; ".join(hints) or hint)
-    what = ". ".join([f"{cause}no frame could be used", *(x + own[0] for x, own in zip(starts, often, strict=True))])
+    told = [f"in {len(own)} of {len(frames)} frames, {text}" for own, text in zip(often, said, strict=True)]
+    what = f"{cause}no frame could be used: {'; '.join(told)}"
     return DataError(what, where=source, allowed="one usable frame or more", hint=hint)
 
 

@@ -196,16 +196,20 @@ class SingleFrameTracker:
         options, pose = self.options, self.sequence.camera_pose
         if self.arm_surface is None:
             return calibration_without_estimation(pose, options.clock_offset_search, "there is no robot to compare")
-        glimpses = []
+        glimpses, failed = list[StampedCloud](), list[DataError]()
         for i in self.calibration_frames:
             try:
                 points, _ = self._finite(self.sequence, i)
-            except DataError:
-                continue  # the second pass reports the reason
+            except DataError as error:
+                failed.append(error)  # the second pass reports the reasons of all frames
+                continue
             thinned = point_cloud.voxel_averages(points, options.filters.voxel_size).points
             glimpses.append(StampedCloud(float(self.sequence.stamps[i]), thinned))
         rng = np.random.default_rng(options.seed)
         source, clock = self.sequence.source, options.clock_offset_search
+        if failed and not glimpses and (clock.search_half_width > 0 or not options.calibration.fix_pose):
+            what = f"none of {len(failed)} frames can be used to calibrate the camera. In the first, {failed[0].what}"
+            raise DataError(what, where=failed[0].where, allowed=failed[0].allowed, hint=failed[0].hint)
         return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:

@@ -288,9 +288,8 @@ def _once(
             where = run.setting_location("recordings", "held_out")
             hint = f"leave out {recording.name} or {same[1].name}"
             raise DataError(what, where=where, allowed="every measurement in one list", hint=hint)
-        if _duplicate(others, recording):
-            text = f"{recording.name} is listed twice as held-out recording, but counts once, so results are as usual"
-            issues.append(Issue("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
+        if same := _duplicate(others, recording):
+            issues.append(replace(same[0], what=f"{same[0].what}, so {recording.name} is left out"))
         else:
             others.append(recording)
     return used, others

@@ -51,6 +51,8 @@ def run_plan(
         if run.plan.goal == "information":
             found, source = _plan_from_settings(run, progress)
         else:
+            if run.model.arms.mode == "servo":  # prescribed arms have no parameters of servos
+                run = replace(run, parameters={k: own for k, own in run.parameters.items() if ".servo_" not in k})
             step = _compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))

@@ -197,7 +197,7 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
             allowed = "no folder of this name, or the folder of an interrupted run"
-            what = "a run works in this hidden folder, but the folder has files that are not from a run"
+            what = "the hidden folder that this run would write into has files that are not from a run"
             raise OutputError(what, where=str(temporary), allowed=allowed, hint="rename it, or choose another --out")
         lock = _locked(temporary)
         if lock is None:

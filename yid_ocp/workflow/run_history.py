@@ -114,8 +114,8 @@ def read_result_file(file: Path) -> dict[str, Any]:
     """Read the result.json of any command. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
         hint, allowed = "give the run folder that `solve` or `diagnose` printed", "a run folder with result.json"
-        fault = "is a file, not a run folder" if is_file(file.parent) else "has no finished run"
-        raise DataError(f"{file.parent} {fault}", where=str(file), allowed=allowed, hint=hint)
+        what = f"{file.parent} {'has no finished run' if file.parent.is_dir() else 'is not an existing folder'}"
+        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):
         what, hint = "the file does not have the result of a run", "repeat the command that made the folder"
@@ -333,8 +333,9 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     found = [result.get("model", result)["parameters"] for result in results]
     runs = dict(zip(labels, map(str, folders), strict=True))
     parameters = _overlaid_parameters(labels, found)
+    first, second = map(_settings, folders)
     told = {"format": "yid-overlay/1", "runs": runs, "parameters": parameters, "channels": channels}
-    first = _settings(folders[0])
+    told["model_difference"] = "" if first is None else _difference(first, second)
     settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}

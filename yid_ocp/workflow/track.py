@@ -101,7 +101,7 @@ def _run_track(
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
         tasks.delete_files()
     if refused is not None:
-        hint = f"{refused.hint}. {folder.path} has pictures, and the reason for each frame"
+        hint = f"{refused.hint}. All reasons, and pictures of readable frames, are in {folder.path}"
         where = refused.where if made is None else run.setting_location("track", "virtual_frames")
         raise DataError(refused.what, where=where, allowed=refused.allowed, hint=hint)
     return CommandOutcome(folder.path, written, None)

@@ -94,7 +94,9 @@ class OpenBag:
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             tool = "rosbag" if self.path.suffix == ".bag" else "ros2 bag"
             what = "the bag cannot be read, because it is incomplete or damaged"
-            hint = f"repair it by `{tool} reindex {self.path}`, or copy it again"
+            hint = f"copy it again, or repair it by `{tool} reindex {self.path}`"
+            if self.path.suffix == ".mcap":
+                hint = f"copy it again, or save its sound part by `mcap recover {self.path} -o NEW.mcap` (MCAP tools)"
             if isinstance(error, MemoryError):
                 what = "the bag cannot be read, because it is damaged or needs too much memory"
                 hint = f"check it by `{tool} info {self.path}`; if it is sound, cut it into shorter bags"

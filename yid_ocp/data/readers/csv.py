@@ -293,7 +293,7 @@ def _read_table(
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
-    numbers, bad = array("d"), list[int]()
+    numbers, bad = array("d"), dict[int, str]()
     if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
@@ -301,22 +301,23 @@ def _read_table(
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
-        except DataError:
+        except DataError as error:
             if not options.skip_bad_lines:
                 raise
-            bad.append(line)
+            bad[line] = error.what
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
     raise_data_error_unless(len(table), "the table has no rows below its header", str(path), allowed, hint)
     n_lines = len(table) + len(bad)
     if len(bad) > _MOST_BAD * n_lines:
-        what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers"
-        where = f"{path}, line {bad[0]}" + (" and later lines" if len(bad) > 1 else "")
-        hint = "set the delimiter, as in --delimiter ';', or leave a column of text out: --columns NAME=skip"
+        at, why = next(iter(bad.items()))
+        what = f"{len(bad)} of {n_lines} lines are not rows of {len(names)} numbers. In the first of them, {why}"
+        where = f"{path}, line {at}" + (" and later lines" if len(bad) > 1 else "")
+        hint = "leave a column of text out, as in --columns NAME=skip, or set the delimiter, as in --delimiter ';'"
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
-        listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
+        listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
         notes = (f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 

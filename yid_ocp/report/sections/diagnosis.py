@@ -28,9 +28,8 @@ _MAX_MAPS = 3  # largest number of recordings with a heat map; trajectories.h5 h
 _MAX_CHANNELS = 3  # largest number of held-out channels that are drawn
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
-_EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
-    ("upper limit of the model error", "lower limit of the model error"), figures.MEASURED_COLOR
-)
+_EVENT_COLORS = {"event": figures.AFTER_COLOR}
+_EVENT_COLORS |= {f"{side} limit of the model error": figures.MEASURED_COLOR for side in ("upper", "lower")}
 _TitledFigures = list[tuple[str, Any]]
 _Chapter = tuple[str, Sequence[str], _TitledFigures]
 """Title, sentences (empty ones are not shown), and figures with their titles."""
@@ -61,12 +60,9 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     floor, rows = {own.channel: own.noise_rmse for own in finding.noise_floor}, []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
-        values = {_NOMINAL_LABEL: (factor * error, None)}
-        if changed and channel in after:
-            values[_EXTENDED_LABEL] = (factor * after[channel][0], None)
-        if channel in floor:
-            values["noise alone"] = (factor * floor[channel], None)
-        rows.append((channel, shown, values))
+        extended = after[channel][0] if changed and channel in after else None
+        errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "noise alone": floor.get(channel)}
+        rows.append((channel, shown, {name: (factor * e, None) for name, e in errors.items() if e is not None}))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
     sentences = []
     if changed:
@@ -78,9 +74,9 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         sentences.append(f"{rest}: with {names}, chi² per degree of freedom of held-out recordings {change}.")
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
-            errors = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
+            sizes = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
             worse = f". The error of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
-            sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
+            sentences.append(f"The error of {most} changes most, from {' to '.join(sizes)}{worse}.")
     else:
         level = f"Its chi² per degree of freedom is {first:.3g} (noise alone gives 1)"
         sentences.append(f"No effect is accepted as cause, so the figure has the nominal model alone. {level}.")

@@ -29,11 +29,8 @@ _MAX_ANIMATIONS = 4  # a page with more is slow to open
 _MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
 _MAX_LISTED_RECORDINGS = 3  # largest number of recordings that are drawn
 _MAX_DRAWN_POINTS = 6  # largest number of points of a group that are drawn
-_ESTIMATE_COLORS = {
-    "start": figures.MEASURED_COLOR,
-    "estimate": figures.LINE_PALETTE[0],
-    "estimate that cannot be trusted": figures.LINE_PALETTE[1],
-}
+_ESTIMATE_COLORS = {"start": figures.MEASURED_COLOR, "estimate": figures.LINE_PALETTE[0]}
+_ESTIMATE_COLORS |= {"estimate that cannot be trusted": figures.LINE_PALETTE[1]}
 _ESTIMATED, _HELD_OUT = "estimated on", "held out"
 _JOINT_CHANNELS = ("position", "velocity", "effort", "position_command")
 _PRISMATIC_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}  # by the unit of a revolute joint
@@ -83,8 +80,7 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
         return None
-    steps = solution.history
-    figure = figures.solution_cost_history_figure([h.cost for h in steps], [h.note for h in steps])
+    figure = figures.solution_cost_history_figure(*zip(*((h.cost, h.note) for h in solution.history), strict=True))
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
