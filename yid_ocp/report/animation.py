@@ -311,7 +311,7 @@ def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t
     """Return configurations (F, n) at times t (F,), with the recorded joint angles."""
     q, joints = told._q_at(t), recording.joints
     if joints is not None:
-        for name in {*joints.names} & {*told.system.mechanism.joint_names}:
+        for name in [name for name in joints.names if name in told.system.mechanism.joint_names]:
             column = joints.position[:, joints.names.index(name)]
             q[:, told.system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
     return q

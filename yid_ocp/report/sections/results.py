@@ -80,7 +80,8 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
         return None
-    figure = figures.solution_cost_history_figure(*zip(*((h.cost, h.note) for h in solution.history), strict=True))
+    steps = solution.history
+    figure = figures.solution_cost_history_figure([h.cost for h in steps], [h.note for h in steps])
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
