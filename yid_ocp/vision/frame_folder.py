@@ -57,10 +57,12 @@ def _read_npz(path: Path) -> _Cloud:
         raise _damaged(path, "it is damaged, or not an NPZ file") from error
     points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write it with numpy.savez(FILE, points=xyz)"
+        found = "missing" if points is None else f"of type {points.dtype} and shape {points.shape}, not numbers (N, 3)"
+        what, hint = f"the array `{_POINTS_ARRAY}` is {found}", "write it with numpy.savez(FILE, points=xyz)"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        what, hint = f"the array `{_COLOURS_ARRAY}` is not one RGB colour per point", "write uint8, or leave it out"
+        what = f"the array `{_COLOURS_ARRAY}` has type {colours.dtype} and shape {colours.shape}"
+        hint = f"write uint8 of shape {points.shape}, or leave `{_COLOURS_ARRAY}` out"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     return points.astype(np.float64), colours
 
@@ -71,7 +73,7 @@ def _read_xyz(path: Path) -> _Cloud:
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
     except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise _damaged(path, "it is not a table with numbers x y z in every row") from error
+        raise _damaged(path, f"it is not a table of numbers x y z ({error})") from error
     if rows.shape[0] and rows.shape[1] < 3:
         raise _damaged(path, f"it has {rows.shape[1]} columns, but needs x, y and z")
     seen = rows[:, 3:6]
@@ -104,7 +106,7 @@ def _read_depth_image(path: Path) -> Array:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
-        what = f"the depth image has shape {image.shape}, type {image.dtype}" if image.size else "the image is damaged"
+        what = f"the depth image has shape {image.shape} and type {image.dtype}" if image.size else "the image is damaged"
         raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint="export it again as 16-bit grey PNG")
     return image.astype(np.float64)
 
@@ -137,7 +139,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
             body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]
         else:
             body = b"\n".join(body.split(b"\n")[min(count, len(body)) :])
-    raise _damaged(path, "it has no vertices")
+    raise _damaged(path, "its header has no line 'element vertex NUMBER', so it has no points")
 
 
 def _damaged(path: Path, why: str) -> DataError:
@@ -150,7 +152,7 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
     """Byte order (empty for ASCII) and elements, in file order, that the header `text` of a PLY file declares."""
     order: str | None = None
     found: list[_Element] = []
-    for line in text.splitlines()[1:]:
+    for number, line in enumerate(text.splitlines()[1:], start=2):
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
@@ -163,9 +165,9 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
             case ["property", kind, name] if found and kind in _NUMPY_TYPES:
                 found[-1][2].append((name, _NUMPY_TYPES[kind]))
             case _:
-                raise _damaged(path, f"this line of its header is wrong: {line[:60]!r}")
+                raise _damaged(path, f"line {number} of its header is no known declaration: {line[:60]!r}")
     if order is None:
-        raise _damaged(path, "its header has no format")
+        raise _damaged(path, "its header has no format, such as the line 'format ascii 1.0'")
     return order, found
 
 
@@ -174,24 +176,29 @@ def _vertices(
 ) -> _Cloud:
     names, kinds = zip(*columns, strict=True) if columns else ((), ())
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
-        raise _damaged(path, "its vertices lack x, y or z, contain lists, or name a property twice")
+        held = ", ".join(name if kind else f"{name} (a list)" for name, kind in columns) or "no properties"
+        raise _damaged(path, f"its vertices have {held}, but need x, y and z, each property once, and no list")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
         raise _damaged(path, f"it is cut off and has only {len(body)} bytes for {count} points")
     if not count:
-        raise _damaged(path, "it has no vertices")
+        raise _damaged(path, "its header states 0 vertices (points)")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
     if order:
         rows = np.frombuffer(body, [(n, order + k) for n, k in columns], count)
         values = np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
     else:
-        try:
-            lines = [line.split() for line in body.split(b"\n", count)[:count]]
-            values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
-        except (ValueError, IndexError) as error:
-            raise _damaged(path, f"a vertex differs from the header ({error})") from error
+        lines = [line.split() for line in body.split(b"\n", count)[:count]]
+        values = np.empty((len(lines), len(wanted)))
+        for i, row in enumerate(lines):
+            try:
+                values[i] = [float(row[names.index(name)]) for name in wanted]
+            except (ValueError, IndexError) as error:
+                at = path.read_bytes().count(b"\n") - body.count(b"\n") + i + 1
+                text, held = b" ".join(row)[:60].decode("latin-1"), ", ".join(names)
+                raise _damaged(path, f"line {at} (point {i + 1}) is '{text}', but needs numbers for {held}") from error
     if len(values) < count:
-        raise _damaged(path, f"it has {len(values)} of the {count} vertices that its header states")
+        raise _damaged(path, f"it has only {len(values)} of the {count} points that its header states")
     return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
 
 
@@ -304,8 +311,10 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        odd = sorted(set(needed) ^ ((set(entry) if isinstance(entry, dict) else set()) - set(bent)))
-        what, hint = f"keys of the intrinsics are missing or unknown: {', '.join(odd)}", "add or remove these keys"
+        own = set(entry) if isinstance(entry, dict) else set()
+        parts = (("missing", set(needed) - own), ("unknown", own - set(known)))
+        said = "; ".join(f"{', '.join(sorted(keys))} {word}" for word, keys in parts if keys)
+        what, hint = f"the intrinsics of the camera have wrong keys ({said})", "add or remove these keys"
         raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
