@@ -159,9 +159,9 @@ def simulate_in_mujoco(
         hint = "build the system with driven joints (model.arms.mode: driven or servo)"
         raise ModelError(what, where="system", allowed="driven joints, and none that is prescribed", hint=hint)
     if tuple(motion.joints) != tuple(system.driven):
-        lost = [name for name in system.driven if name not in motion.joints]
-        what = f"the motion lacks the driven joints {', '.join(lost)}"
-        what = what if lost else f"the motion has {', '.join(motion.joints)}, which are not the driven joints in order"
+        lacking = ", ".join(name for name in system.driven if name not in motion.joints)
+        what = f"the motion has {', '.join(motion.joints)}, which are not the driven joints in order"
+        what = f"the motion lacks the driven joints {lacking}" if lacking else what
         allowed, hint = f"a motion of {', '.join(system.driven)}", "make the motion for `system.driven`"
         raise ModelError(what, where="motion.joints", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
@@ -188,7 +188,8 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        what, hint = "the simulation diverged", f"pass a time_step shorter than {chosen.time_step:g} s, or a slower motion"
+        hint = f"pass a time_step shorter than {chosen.time_step:g} s, or a slower motion"
+        what = "the simulation diverged during the motion"
         raise ModelError(what, where=f"MuJoCo, {lost or 'efforts'}", allowed="finite positions and efforts", hint=hint)
     return result
 
@@ -347,8 +348,8 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
         yield (calm := float(np.abs(data.qvel).max()))
         fastest = scene.model.joint(int(np.abs(data.qvel).argmax())).name
         step(held, data, nstep=block)
-    what = f"joint '{fastest}' still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling, but must move at "
-    what += f"less than {_REST:g} rad/s"
+    what = f"joint '{fastest}' still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling"
+    what += f" (limit {_REST:g} rad/s)"
     hint = "give every joint of the object more damping, and enough stiffness to carry the weight"
     raise ModelError(what, where="settling before the motion", allowed="an object that comes to rest", hint=hint)
 

@@ -106,7 +106,7 @@ def _read_depth_image(path: Path) -> Array:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
-        what = f"the depth image has shape {image.shape} and type {image.dtype}" if image.size else "the image is damaged"
+        what = f"the depth image has shape {image.shape}, type {image.dtype}" if image.size else "the image is damaged"
         raise DataError(what, where=str(path), allowed="16-bit grey PNG", hint="export it again as 16-bit grey PNG")
     return image.astype(np.float64)
 

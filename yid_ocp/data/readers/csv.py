@@ -293,7 +293,7 @@ def _read_table(
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
-    numbers, bad = array("d"), list[int]()
+    numbers, bad, faults = array("d"), list[int](), list[str]()
     if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
@@ -301,10 +301,11 @@ def _read_table(
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
-        except DataError:
+        except DataError as error:
             if not options.skip_bad_lines:
                 raise
             bad.append(line)
+            faults.append(error.what)
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
     raise_data_error_unless(len(table), "the table has no rows below its header", str(path), allowed, hint)
@@ -317,7 +318,8 @@ def _read_table(
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        notes = (f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})",)
+        said = f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})"
+        notes = (f"{said}. Of the first, {faults[0]}. The recording has no samples at their times",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
