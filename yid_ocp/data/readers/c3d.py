@@ -94,8 +94,8 @@ def _markers(path: Path) -> _Markers:
         computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise _unreadable(path) from error
-    what = "the C3D file has no frames or no frame rate" if labels else "the C3D file has no labelled markers"
-    allowed, hint = "labelled 3-D points and their frame rate", "label the markers, and export their trajectories again"
+    what = f"the C3D file has {len(position)} frames at {rate:g} Hz, and {len(labels)} labelled markers"
+    allowed, hint = "all three above 0", "label the markers, and export their trajectories again"
     raise_data_error_unless(rate > 0 and len(position) and labels, what, str(path), allowed, hint)
     what, known = f"the unit of the markers is '{unit}', which is unknown", ", ".join(_LENGTH_UNITS)
     raise_data_error_unless(unit in ("", *_LENGTH_UNITS), what, str(path), known, "export the file again in mm")

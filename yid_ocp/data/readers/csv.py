@@ -278,10 +278,11 @@ def _table_rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
 
 def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
     """Lines of a file. Raises `DataError` for a line longer than the limit."""
-    while line := file.readline(_MAX_LINE_LENGTH + 1):
+    for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE_LENGTH + 1), ""), start=1):
         if len(line) > _MAX_LINE_LENGTH:
-            what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
-            raise DataError(what, where=str(path), allowed=allowed, hint="export the measurements again as CSV")
+            what, where = f"the line has more than {_MAX_LINE_LENGTH} characters", f"{path}, line {number}"
+            hint = "export the measurements again as CSV"
+            raise DataError(what, where=where, allowed="one row of numbers per line", hint=hint)
         yield line
 
 
@@ -334,7 +335,8 @@ def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> No
     raise_data_error_unless(len(header) > 1, f"the table has one column, '{header[0]}'", str(path), _ALLOWED, hint)
     name, count = Counter(header).most_common(1)[0] if options.has_header else ("", 1)
     allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
-    raise_data_error_unless(count == 1, f"two columns are called '{name}'", where, allowed, hint)
+    at = ", ".join(str(i) for i, own in enumerate(header, start=1) if own == name)
+    raise_data_error_unless(count == 1, f"{count} columns are called '{name}' (columns {at})", where, allowed, hint)
 
 
 def _is_number(cell: str) -> bool:
@@ -368,8 +370,10 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
-    if any("," in cell for cell in values) and any("." in cell for cell in values):
-        what, allowed = "the row has numbers with commas and numbers with points", "decimal commas or decimal points"
+    commas, points = ([cell for cell in values if mark in cell] for mark in ",.")
+    if commas and points:
+        what = f"the row has numbers with commas ('{commas[0]}') and numbers with points ('{points[0]}')"
+        allowed = "decimal commas or decimal points"
         raise DataError(what, where=where, allowed=allowed, hint=f"export it without thousands separators{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
