@@ -138,7 +138,7 @@ def test_units_and_frames_of_clouds(folder):
         ({"frame": "base"}, "no coordinate frame 'base'"),
         ({"posse": 1}, "there is no key 'posse'"),
         ({"format": "yid-frames/7"}, "format of the frames"),
-        ({"intrinsics": {"width": 3}}, "cx, cy, fx, fy, height missing"),
+        ({"intrinsics": {"width": 3}}, "missing .cx, cy, fx, fy, height."),
         ({"depth_unit": -1}, "depth_unit is -1"),
     ],
 )

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp import files
 from yid_ocp.arrays import Array
+from yid_ocp.data.recording import raise_data_error_unless
 from yid_ocp.errors import DataError, OutputError, require_known_names
 from yid_ocp.vision import frames
 
@@ -280,9 +281,9 @@ def _read_camera(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     head = files.read_input_json(path)
-    if not isinstance(head, dict):
-        what, hint = "the file holds no JSON object {...}", 'write for example {"pose": [[...], ...], "unit": "m"}'
-        raise DataError(what, where=str(path), allowed=f"an object with {', '.join(_CAMERA_FILE_KEYS)}", hint=hint)
+    what, hint = "the file holds no JSON object {...}", 'write for example {"pose": [[...], ...], "unit": "m"}'
+    allowed = f"an object with {', '.join(_CAMERA_FILE_KEYS)}"
+    raise_data_error_unless(isinstance(head, dict), what, str(path), allowed, hint)
     require_known_names(head, _CAMERA_FILE_KEYS, "key", str(path), DataError)
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         what = f"the format of the frames is '{head['format']}', which this version of yid_ocp does not read"
@@ -295,9 +296,8 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: frames.CameraIn
     known = (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
     for name in names:
         kind = Path(name).suffix.lower()
-        if kind not in known:
-            what, hint = f"'{name}' is neither a cloud nor a depth image", "convert the file, or remove its row"
-            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
+        what, hint = f"'{name}' is neither a cloud nor a depth image", "convert the file, or remove its row"
+        raise_data_error_unless(kind in known, what, str(folder / STAMP_FILE), ", ".join(known), hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
             what, hint = f"the intrinsics of the camera are missing, which '{name}' needs", "add the key `intrinsics`"
             allowed = '"intrinsics": {"width": 640, "height": 480, "fx": 577, "fy": 577, "cx": 319.5, "cy": 239.5}'
@@ -311,10 +311,8 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        own = set(entry) if isinstance(entry, dict) else set()
-        parts = (("missing", set(needed) - own), ("unknown", own - set(known)))
-        said = "; ".join(f"{', '.join(sorted(keys))} {word}" for word, keys in parts if keys)
-        what, hint = f"the intrinsics of the camera have wrong keys ({said})", "add or remove these keys"
+        lacking = ", ".join(sorted(set(needed) - set(entry if isinstance(entry, dict) else ()))) or "none"
+        what, hint = f"keys of the intrinsics are missing ({lacking}) or unknown", "add or remove these keys"
         raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
@@ -335,17 +333,14 @@ def _number(value: object, name: str, where: str) -> float:
 
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     allowed, hint = "CSV with the columns file, t [s]", "write the row file,t and one for each frame, as 0.ply,0.033"
-    if not path.exists():
-        raise DataError("the file of time stamps does not exist", where=str(path), allowed=allowed, hint=hint)
+    raise_data_error_unless(path.exists(), "the file of time stamps does not exist", str(path), allowed, hint)
     try:
         rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
     except csv.Error as error:
         raise DataError(f"the file is not CSV: {error}", where=str(path), allowed=allowed, hint=hint) from error
-    if not rows:
-        raise DataError("the table of time stamps has no rows", where=str(path), allowed=allowed, hint=hint)
-    if not {"file", "t"} <= set(rows[0]):
-        what, hint = f"the columns are {', '.join(map(str, rows[0]))}, not file and t", "rename them to file and t"
-        raise DataError(what, where=f"{path}, line 1", allowed=allowed, hint=hint)
+    raise_data_error_unless(rows, "the table of time stamps has no rows", str(path), allowed, hint)
+    what, hint = f"the columns are {', '.join(map(str, rows[0]))}, not file and t", "rename them to file and t"
+    raise_data_error_unless({"file", "t"} <= set(rows[0]), what, f"{path}, line 1", allowed, hint)
     times = []
     for number, row in enumerate(rows, start=2):
         try:

@@ -22,7 +22,14 @@ from yid_ocp.data.foreign_formats import (
     joint_values_of_message,
 )
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
+from yid_ocp.data.recording import (
+    JOINT_CHANNEL_UNITS,
+    JointGroup,
+    PointGroup,
+    Recording,
+    SensorChannelGroup,
+    raise_data_error_unless,
+)
 from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
@@ -173,12 +180,8 @@ def _read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. In files without `JointState`,
-    joints come from Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`),
-    `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`.
-    `joint_topics` selects these topics even if there is a `JointState`, and `message_fields` reads messages of any
-    type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
-    reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
+    docs/reference/import_formats.md has the types of messages. Points have one group per reference frame. Each topic of
+    `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
     Times are header stamps, relative to the first message. If any message has no stamp, all times are recording times.
     A message that repeats time and values of the previous one counts once. A joint channel that is empty or all NaN is
@@ -303,9 +306,8 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     where, allowed = str(bag.path), "entries CHANNEL=/TOPIC.FIELD of one topic, one of them for position"
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
-        if not path:
-            what, hint = f"'{channel}={topic}' names a topic, but no field", f"write --field {channel}={topic}.FIELD"
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+        what, hint = f"'{channel}={topic}' names a topic, but no field", f"write --field {channel}={topic}.FIELD"
+        raise_data_error_unless(path, what, where, allowed, hint)
     if len(topics) > 1 or (fields and "position" not in fields):
         what = f"the fields belong to {len(topics)} topics" if len(topics) > 1 else "the channel position has no field"
         hint = "choose fields of one topic" if len(topics) > 1 else f"add --field position={topics[0]}.FIELD"
@@ -444,9 +446,8 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
             hint = nearest_name_question(name, known) or f"choose recorded joints: --joints {','.join(known[:2])}"
             raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
-    if got != set(wanted):
-        what, allowed = f"no message has all of {', '.join(wanted)}", f"joints of one of these sets: {allowed}"
-        raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
+    what, allowed = f"no message has all of {', '.join(wanted)}", f"joints of one of these sets: {allowed}"
+    raise_data_error_unless(got == set(wanted), what, where, allowed, "choose joints of one set: --joints NAME,NAME")
 
 
 def _on_one_clock(

@@ -67,19 +67,9 @@ _DEFAULTS = _CsvOptions()
 def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) -> Recording:
     """Read a recording from a CSV table with one row per time. Its points become one group `points`.
 
-    Columns are recognised by name, optionally with a unit (`time [ms]`, `q1_deg`):
-
-    - time: `t`, `time`, `timestamp`
-    - joints: `q_<joint>`, `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, or the spelling of other
-      loggers: `pos_<joint>`, `<joint>.vel`, `tau1`, `dq1`, `tau_J[0]`, `/joint_states/<joint>/effort`
-    - sensors on a link: `<sensor>_Q_x` with Q = force, torque, angular_velocity, specific_force
-    - points: `<point>_x`, `<point>_y`, `<point>_z`
-
-    Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
-    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. Numbers may have a decimal
-    comma, times may be time stamps of ISO 8601 (date and time of day). The joints, the points or a sensor have no
-    sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
-    cell, option or unit cannot be understood, or if `validated_recording` refuses the result.
+    docs/reference/import_formats.md has the names of columns and the forms of numbers. Exports of Motive, Nexus and QTM
+    are recognised by their headers. The joints, the points or a sensor have no sample at a time if all their cells in
+    this row are empty. Raises `DataError` if anything cannot be understood, or `validated_recording` refuses it.
     """
     path = Path(path)
     said = options.description, path.name, path.stem, file_sha256(path)

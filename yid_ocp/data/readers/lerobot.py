@@ -71,13 +71,9 @@ def _read_lerobot_episode(
 ) -> Recording:
     """Read one episode, counted from zero, from the folder of a LeRobot dataset.
 
-    `observation.state` is the measured position of the joints. If the names of its entries end in `.pos`, `.vel` and
-    `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
-    are frame index / frame rate, a nominal clock. `units` must state the unit of angles (often degrees) if they cannot
-    be radians, or if LeRobot never records this robot in radians. With degrees, a gripper is left out, because LeRobot
-    records it in per cent of its range. `notes` lists images and other features. The other
-    options are those of `JointPointAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
-    `DataError` without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
+    docs/reference/import_formats.md has the features and their units. Times are frame index / frame rate, a nominal
+    clock. `notes` lists images and other features. Options are those of `JointPointAndUnitOptions`. Raises `DataError`
+    without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
