@@ -332,7 +332,7 @@ def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
     current = "effort of 'a' is a current, but its torque constant is not given"
     refused(path, current, units={"effort": "A"}, torque_constants={"b": 1.0})
-    refused(path, "efforts are in .*, not in a unit of current", torque_constants={"*": 1.0})
+    refused(path, "unit of the efforts is not a unit of current", torque_constants={"*": 1.0})
 
 
 @pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])

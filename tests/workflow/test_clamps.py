@@ -161,7 +161,7 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     folder_of(tmp_path / "old")
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline_run_folders=[old]",))
-    with pytest.raises(ConfigError, match=r"model\.object differs"):
+    with pytest.raises(ConfigError, match=r"model\.object\.\w+\.beam\.links is 3 instead of 2"):
         run_history.estimates_of_each_baseline_run(run)
 
 

@@ -105,8 +105,7 @@ def plan_informative_motion(
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
-        what = f"none of the {len(begins)} random initial motions keeps the limits, however small it is made"
-        allowed = "limits within which the arms can move"
+        what, allowed = f"none of {len(begins)} random motions keeps the limits", "limits within which arms can move"
         hint = "raise plan.limits.max_acceleration, velocity_fraction or effort_fraction, or plan.duration"
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
     unseen = _unseen(experiment, [rows for _, rows in begins])

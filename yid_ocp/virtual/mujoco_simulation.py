@@ -153,17 +153,15 @@ def simulate_in_mujoco(
         Full backlash width of gears behind servos [rad].
     """
     chosen = simulation or SimulationOptions()
-    if system.prescribed or not system.driven:
-        fault = f"prescribes {', '.join(system.prescribed)}" if system.prescribed else "has no driven joint"
-        what = f"the system {fault}, but a controller can only move driven joints"
-        hint = "build the system with driven joints (model.arms.mode: driven or servo)"
-        raise ModelError(what, where="system", allowed="driven joints, and none that is prescribed", hint=hint)
-    if tuple(motion.joints) != tuple(system.driven):
+    if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
         lacking = ", ".join(name for name in system.driven if name not in motion.joints)
-        what = f"the motion has {', '.join(motion.joints)}, which are not the driven joints in order"
-        what = f"the motion lacks the driven joints {lacking}" if lacking else what
-        allowed, hint = f"a motion of {', '.join(system.driven)}", "make the motion for `system.driven`"
-        raise ModelError(what, where="motion.joints", allowed=allowed, hint=hint)
+        what = (
+            f"the motion lacks the driven joints {lacking}" if lacking else f"the motion has {', '.join(motion.joints)}"
+        )
+        what = f"{', '.join(system.prescribed)} are prescribed, not driven joints" if system.prescribed else what
+        allowed = f"a motion of {', '.join(system.driven) or 'driven joints'} in this order, and no prescribed joint"
+        hint = "make the motion for `system.driven`, of a system with model.arms.mode: driven or servo"
+        raise ModelError(what, where="motion.joints and system", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
@@ -188,9 +186,9 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        hint = f"pass a time_step shorter than {chosen.time_step:g} s, or a slower motion"
-        what = "the simulation diverged during the motion"
-        raise ModelError(what, where=f"MuJoCo, {lost or 'efforts'}", allowed="finite positions and efforts", hint=hint)
+        hint = f"pass a time_step below {chosen.time_step:g} s, or a slower motion"
+        where = f"MuJoCo, {lost or 'efforts'}"
+        raise ModelError("the simulation diverged", where=where, allowed="finite positions and efforts", hint=hint)
     return result
 
 
@@ -346,10 +344,8 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
             hint = "begin nearer to the grasp (initial_joint_angles), or simulate with a shorter time step"
             raise ModelError(what, where=f"MuJoCo, {lost}", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
-        fastest = scene.model.joint(int(np.abs(data.qvel).argmax())).name
         step(held, data, nstep=block)
-    what = f"joint '{fastest}' still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling"
-    what += f" (limit {_REST:g} rad/s)"
+    what = f"the object still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling (limit {_REST:g} rad/s)"
     hint = "give every joint of the object more damping, and enough stiffness to carry the weight"
     raise ModelError(what, where="settling before the motion", allowed="an object that comes to rest", hint=hint)
 
@@ -476,7 +472,7 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Played:
-    """Times (K,) of all steps, angles or torques (K, nj) of the moved joints, points (K, np, 3), and what diverged."""
+    """Times (K,) of all steps, angles or torques (K, nj) of the moved joints, and points (K, np, 3)."""
 
     t: Array
     values: Array

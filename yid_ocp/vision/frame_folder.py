@@ -214,10 +214,8 @@ def read_frame_folder(
 ) -> frames.FrameSequence:
     """Read a folder of point clouds or depth images as a frame sequence, one frame at a time.
 
-    `camera.json` (`yid-frames/1`) holds `pose` (4x4), `frame` ("camera" or "world") and `unit` ("m" or "mm") of clouds,
-    `intrinsics` and `depth_unit` [m] of depth images. `timestamps.csv` has the columns `file` and `t` [s]. The files
-    are PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order; each is read on demand. The arguments
-    `pose` (4, 4) and `unit` replace the folder's values. Raises `DataError` if an entry is missing or invalid.
+    docs/howto/vision.md has the files and keys of such a folder. The arguments `pose` (4, 4) and `unit` replace the
+    folder's values. Raises `DataError` if an entry is missing or invalid.
     """
     path = Path(folder)
     if not path.is_dir():

@@ -22,14 +22,7 @@ from yid_ocp.data.foreign_formats import (
     joint_values_of_message,
 )
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import (
-    JOINT_CHANNEL_UNITS,
-    JointGroup,
-    PointGroup,
-    Recording,
-    SensorChannelGroup,
-    raise_data_error_unless,
-)
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
@@ -306,8 +299,9 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
     where, allowed = str(bag.path), "entries CHANNEL=/TOPIC.FIELD of one topic, one of them for position"
     for channel, (topic, _, path) in split.items():
         bag.check_topic_is_one_of(topic, [known.name for known in bag.topics], "messages")
-        what, hint = f"'{channel}={topic}' names a topic, but no field", f"write --field {channel}={topic}.FIELD"
-        raise_data_error_unless(path, what, where, allowed, hint)
+        if not path:
+            what, hint = f"'{channel}={topic}' names a topic, but no field", f"write --field {channel}={topic}.FIELD"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
     if len(topics) > 1 or (fields and "position" not in fields):
         what = f"the fields belong to {len(topics)} topics" if len(topics) > 1 else "the channel position has no field"
         hint = "choose fields of one topic" if len(topics) > 1 else f"add --field position={topics[0]}.FIELD"
@@ -446,8 +440,9 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
             hint = nearest_name_question(name, known) or f"choose recorded joints: --joints {','.join(known[:2])}"
             raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
-    what, allowed = f"no message has all of {', '.join(wanted)}", f"joints of one of these sets: {allowed}"
-    raise_data_error_unless(got == set(wanted), what, where, allowed, "choose joints of one set: --joints NAME,NAME")
+    if got != set(wanted):
+        what, allowed = f"no message has all of {', '.join(wanted)}", f"joints of one of these sets: {allowed}"
+        raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
 
 
 def _on_one_clock(
@@ -476,8 +471,10 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
             if len(values) == len(own):
                 rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
-                at = f"the message {seconds(message):.4g} s after the first"
-                what = f"{at} has {len(values)} values of '{channel}' for {len(own)} joints"
+                what = (
+                    f"a message has {len(values)} values of '{channel}' for {len(own)} joints, {seconds(message):.4g} s"
+                )
+                what += " after the first"
                 hint = "correct the node that publishes the topic, or choose another topic with --joint-topic"
                 raise DataError(what, where=where, allowed="one value for each joint, or none", hint=hint)
         if rows and len(rows) < len(states):

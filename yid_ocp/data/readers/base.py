@@ -155,8 +155,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         elif options.torque_constants or options.gear_ratios:
-            what = "torque constants or gear ratios are given, but the file has no efforts that they could convert"
-            hint = "leave out --torque-constants and --gear-ratios"
+            what, hint = "torque constants or gear ratios are given, but the file has no efforts", "leave them out"
             raise DataError(what, where=where, allowed="both with efforts", hint=hint)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen, chosen = list[PointGroup](), options.point_names
@@ -204,8 +203,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
                 raise DataError(what, where=where, allowed=allowed, hint=f"write for example {pattern}=0.1")
     if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
-            unit = (options.units or {}).get("effort", "N m")
-            what = f"torque constants or gear ratios are given, but the efforts are in {unit}, not in a unit of current"
+            what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"
             allowed = "torque constants and gear ratios with --units effort=A or effort=mA"
             raise DataError(what, where=where, allowed=allowed, hint="add --units effort=A, or leave them out")
         return np.ones(len(names))

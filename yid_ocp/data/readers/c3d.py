@@ -48,10 +48,8 @@ def _read_c3d(
 
     C3D has no time stamps: the times are frame index / rate from zero, a `nominal` clock. The file states rate and
     unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin) is
-    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `point_names` maps the markers to
-    keep to new names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
-    unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
-    `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
+    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `notes` lists omitted content.
+    Raises `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
     """
     path = Path(path)
     digest, found = file_sha256(path), _markers(path)

@@ -325,8 +325,7 @@ def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> No
     raise_data_error_unless(len(header) > 1, f"the table has one column, '{header[0]}'", str(path), _ALLOWED, hint)
     name, count = Counter(header).most_common(1)[0] if options.has_header else ("", 1)
     allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
-    at = ", ".join(str(i) for i, own in enumerate(header, start=1) if own == name)
-    raise_data_error_unless(count == 1, f"{count} columns are called '{name}' (columns {at})", where, allowed, hint)
+    raise_data_error_unless(count == 1, f"{count} columns are called '{name}'", where, allowed, hint)
 
 
 def _is_number(cell: str) -> bool:
@@ -360,10 +359,8 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
-    commas, points = ([cell for cell in values if mark in cell] for mark in ",.")
-    if commas and points:
-        what = f"the row has numbers with commas ('{commas[0]}') and numbers with points ('{points[0]}')"
-        allowed = "decimal commas or decimal points"
+    if any("," in cell for cell in values) and any("." in cell for cell in values):
+        what, allowed = "the row has numbers with commas and numbers with points", "decimal commas or decimal points"
         raise DataError(what, where=where, allowed=allowed, hint=f"export it without thousands separators{_OR_SKIP}")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
