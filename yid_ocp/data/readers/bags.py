@@ -471,10 +471,8 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
             if len(values) == len(own):
                 rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
-                what = (
-                    f"a message has {len(values)} values of '{channel}' for {len(own)} joints, {seconds(message):.4g} s"
-                )
-                what += " after the first"
+                what = f"a message has {len(values)} values of '{channel}' for {len(own)} joints"
+                what += f", {seconds(message):.4g} s after the first message"
                 hint = "correct the node that publishes the topic, or choose another topic with --joint-topic"
                 raise DataError(what, where=where, allowed="one value for each joint, or none", hint=hint)
         if rows and len(rows) < len(states):
