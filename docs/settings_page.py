@@ -12,7 +12,6 @@ from typing import Any
 
 from yid_ocp.config.schema import option_info_from_annotation, section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.model.objects import OBJECT_KINDS
 from yid_ocp.options import Option, class_options_by_key, describe_type, mapping_value_type, variadic_tuple_entry_type
 
 HEAD = """\
@@ -82,7 +81,58 @@ EXAMPLES: Mapping[str, str] = {
     "virtual_arm": """\
 virtual_arm: {friction_law: load, max_relative_link_mass_error: 0.03, encoder_counts_per_turn: 4096}
 """,
-    **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
+    "model.object, kind: segments": """\
+model:
+  object:
+    kind: segments
+    mount: {parent_frame: tool0}
+    named_segments:
+      trunk: {length: 0.5, mass: 0.05, radius: 0.01}                           # [m], [kg], [m]
+      twig: {parent: trunk, length: 0.3, mass: 0.02, radius: 0.006, rpy: [0.5, 0.0, 0.0]}
+""",
+    "model.object.named_segments.NAME": """\
+model:
+  object:
+    kind: segments
+    named_segments:
+      beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
+values_given_as_rigidities: true, clamped_at_base: true}
+""",
+    "model.object, kind: tapered_rod": """\
+model:
+  object: {kind: tapered_rod, length: 1.2, mass: 0.08, base_radius: 0.006, tip_radius: 0.002}    # [m], [kg]
+parameters:
+  rod.bend: {free: true, initial: 20.0}    # [N m^2]
+""",
+    "model.object, kind: cable": """\
+model:
+  object:
+    kind: cable
+    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
+    child_branch_vertex_names: {side: [p2, s1, s2]}
+    undeformed_shape_file: undeformed.csv
+    end_clamp_grasp_kind: axis
+""",
+    "model.object.branch_properties_by_name.NAME": """\
+model:
+  object:
+    kind: cable
+    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
+    undeformed_shape_file: undeformed.csv
+    child_branch_vertex_names: {side: [p2, s1, s2]}
+    branch_properties_by_name:
+      side: {linear_density: 0.03, has_separate_twist_damping: true}    # [kg/m]
+""",
+    "model.object, kind: foam_y": """\
+model:
+  object: {kind: foam_y, links: 8}
+""",
+    "model.object.mount": """\
+model:
+  object:
+    kind: foam_y
+    mount: {parent_frame: base, xyz: [0.85, 0.0, -0.93], rpy: [0.0, 0.0, 1.5708]}    # [m], [rad]
+""",
     "The file": """\
 description: A cable of 1 m, swung by a UR5
 model: {robot: package:ur5, object: {kind: segments, named_segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}

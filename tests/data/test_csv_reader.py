@@ -124,7 +124,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "other delimiter": ("t;q_a\n0;1\n", {"delimiter": ","}, "one column, 't;q_a'", "--delimiter ';'"),
     "one column": ("t\n0\n", {}, "one column, 't'", ""),
     "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
-    "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "two columns are called 'q_a'", ""),
+    "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "2 columns are called 'q_a'", ""),
     "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' have the same meaning, position a", ""),
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),

@@ -86,7 +86,7 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
     }  # fmt: skip
     page = (outcome.folder / "report.html").read_text()
     assert '<section id="plan">' in page
-    assert "The uncertainty of the position is unknown. To get it, set" in page
+    assert "The uncertainty of the position is unknown, because the plan uses initial values" in page
     message = json.loads((outcome.folder / "trajectory.json").read_text())
     assert message["joint_names"] == ["shoulder"]
     planned = outcome.output.joint_positions[:, 0]

@@ -241,7 +241,7 @@ def test_tables_are_aligned_without_empty_columns():
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
     recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
     *_, row, _, end = terminal.recording_summary_lines(recording)
-    assert (row.split(), end) == (["joints", "2", "10", "0.1", "position", "[rad]", "a,", "b"], "duration: 0.1 s")
+    assert (" ".join(row.split()), end) == ("joints 2 10 0.1 0.1 position [rad] a, b", "duration: 0.1 s")
 
 
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():

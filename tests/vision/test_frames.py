@@ -81,13 +81,13 @@ def test_formats_of_clouds(open3d, folder, ending, coloured):
 @pytest.mark.parametrize(
     ("name", "make", "message"),
     [
-        ("a.npz", lambda file: np.savez(file, dots=CLOUD), "no array `points`"),
-        ("a.npz", lambda file: np.savez(file, points=CLOUD[:, :2]), "no array `points`"),
+        ("a.npz", lambda file: np.savez(file, dots=CLOUD), "`points` is missing"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD[:, :2]), r"shape \(3, 2\), not numbers"),
         ("a.npz", lambda file: np.savez(file, points=np.array([{}])), "damaged"),
-        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "is not one RGB colour per point"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), r"has type uint8 and shape \(2, 3\)"),
         ("a.npz", lambda file: file.write_bytes(b"PK nonsense"), "damaged"),
         ("a.xyz", lambda file: file.write_text("1 2\n3 4\n"), "has 2 columns"),
-        ("a.xyz", lambda file: file.write_text("1 2 here\n"), "is not a table"),
+        ("a.xyz", lambda file: file.write_text("1 2 here\n"), "is not a table of numbers x y z .*here"),
         ("a.xyz", lambda file: file.write_text("# nothing\n"), "has no points"),
     ],
 )
@@ -138,7 +138,7 @@ def test_units_and_frames_of_clouds(folder):
         ({"frame": "base"}, "no coordinate frame 'base'"),
         ({"posse": 1}, "there is no key 'posse'"),
         ({"format": "yid-frames/7"}, "format of the frames"),
-        ({"intrinsics": {"width": 3}}, "missing or unknown: cx, cy, fx, fy, height"),
+        ({"intrinsics": {"width": 3}}, "missing .cx, cy, fx, fy, height."),
         ({"depth_unit": -1}, "depth_unit is -1"),
     ],
 )
@@ -237,18 +237,18 @@ WRONG = {
     "no ply": (b"plx\n", "has no header"),
     "no end": (ply_head("ascii")[:-12], "has no header"),
     "no format": (ply_head("ascii").replace(b"format ascii 1.0\n", b"") + TEXT, "its header has no format"),
-    "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "header is wrong: 'format utf 1.0'"),
-    "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "header is wrong: 'property flaot x'"),
-    "no z": (ply_head("ascii").replace(b"float z", b"float w") + TEXT, "lack x, y or z"),
-    "two of a name": (ply_head("ascii").replace(b"double nx", b"double x") + TEXT, "lack x, y or z"),
+    "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "line 2 .*: 'format utf 1.0'"),
+    "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "header is no .*: 'property flaot x'"),
+    "no z": (ply_head("ascii").replace(b"float z", b"float w") + TEXT, "w, .*need x, y and z"),
+    "two of a name": (ply_head("ascii").replace(b"double nx", b"double x") + TEXT, "each property once"),
     "lists before": (ply_head("ascii", before=FACES.decode()) + TEXT, r"lists \('face'\)"),
     "too many": (ply_head("binary_little_endian", 3_000_000_000) + ply_body("<"), "for 3000000000 points"),
     "negative": (ply_head("ascii", -1) + TEXT, "element vertex -1"),
-    "none": (ply_head("ascii", 0), "has no vertices"),
+    "none": (ply_head("ascii", 0), "states 0 vertices"),
     "cut": (SOUND["little"][:-5], "for 7 points"),
     "cut by one byte": (SOUND["little"][:-1], "for 7 points"),
-    "cut text": (ply_head("ascii") + TEXT[:90], "a vertex differs|vertices are missing|cut off"),
-    "words": (ply_head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), "a vertex differs"),
+    "cut text": (ply_head("ascii") + TEXT[:90], "needs numbers for|of the 7 points|cut off"),
+    "words": (ply_head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), r"\(point \d\) is .* one .*, but needs numbers"),
 }
 
 

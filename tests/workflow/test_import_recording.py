@@ -96,7 +96,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "text in place of a pair": ("run.csv", GOOD, "--points tip=", "'tip=' is not NAME=VALUE"),
     "text in place of a number": ("run.csv", GOOD, "--gear-ratios a=fast", "'fast' is not a number"),
     "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "unit of current"),
-    "a constant without efforts": ("run.csv", GOOD, "--torque-constants a=1", "there are no efforts"),
+    "a constant without efforts": ("run.csv", GOOD, "--torque-constants a=1", "the file has no efforts"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "--joint-topic does not apply"),
     "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),
     "a section that is none": ("run.csv", GOOD, "--config wrong.yaml", "there is no key 'colums'"),

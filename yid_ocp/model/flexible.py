@@ -221,12 +221,13 @@ def edge_to_edge_rotations_from_vertices(vertices: ArrayLike, initial_frame: Arr
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        what, hint = f"the vertices have the shape {points.shape}", "pass for example [[0, 0, 0], [0, 0, 0.1]]"
+        what, hint = f"the vertices have shape {points.shape}, not (k, 3)", "pass for example [[0, 0, 0], [0, 0, 0.1]]"
         raise ModelError(what, where="vertices of the polyline", allowed="(k, 3) with k of 2 or more", hint=hint)
     edges = np.diff(points, axis=0)
     if not np.all(np.linalg.norm(edges, axis=1) > 0):
         index = int(np.argmin(np.linalg.norm(edges, axis=1) > 0))
         what, hint = f"vertices {index} and {index + 1} coincide or are not finite", "remove or correct one of them"
+        what += f": {points[index]} and {points[index + 1]}"
         raise ModelError(what, where="vertices of the polyline", allowed="distinct, finite vertices", hint=hint)
     frame = np.eye(3) if initial_frame is None else np.asarray(initial_frame, float)
     rotations = []

@@ -105,7 +105,7 @@ def plan_informative_motion(
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
-        what, allowed = "none of the random initial motions keeps the limits", "limits within which the arms can move"
+        what, allowed = f"none of {len(begins)} random motions keeps the limits", "limits within which arms can move"
         hint = "raise plan.limits.max_acceleration, velocity_fraction or effort_fraction, or plan.duration"
         raise ConfigError(what, where="plan.limits", allowed=allowed, hint=hint)
     unseen = _unseen(experiment, [rows for _, rows in begins])
@@ -186,12 +186,13 @@ def _size(effect: EffectBase) -> Array:
 def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions) -> None:
     """Raise `ConfigError` if the arms violate their limits at the start."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
-    for name, low, high in zip(mover.step.system.prescribed, search.lower, search.upper, strict=False):
+    starts = mover.moved_joint_start_positions
+    for name, at, low, high in zip(mover.step.system.prescribed, starts, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
             unit = next(joint.coordinate_unit for joint in mover.step.system.mechanism.joints if joint.name == name)
             what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
             where, hint = "plan.start_joint_positions", f"set plan.start_joint_positions.{name} within its limits"
-            raise ConfigError(what, where=where, allowed="positions within the limits of the joints", hint=hint)
+            raise ConfigError(what, where=where, allowed=f"{at + low:.4g} to {at + high:.4g} {unit}", hint=hint)
     values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
     if broken := limits.worst_value_and_bound_by_violated_limit(values):
         parts = ((what, *passed) for what, passed in broken.items())
@@ -279,7 +280,8 @@ def _plan(
     best = int(np.argmax([one.configured_criterion for one in judged]))
     chosen = judged[best]
     if not np.isfinite(chosen.configured_criterion):
-        what, hint = "the model cannot follow any planned motion by its torques", "lower plan.limits.max_acceleration"
+        what = f"the simulation of the model by planned torques failed for all {len(found)} motions"
+        hint = "lower plan.limits.max_acceleration, or plan more motions: plan.n_random_starts: 20"
         raise SolverError(what, where="plan", allowed="a motion that the model follows with its torques", hint=hint)
     w, rounds, message = chosen.w, count_with_noun(chosen.n_iterations, "round"), "the motion was found"
     if chosen.final_criterion == chosen.initial_criterion and not chosen.is_converged:

@@ -337,19 +337,22 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         return
     place, asked = ", ".join(f"{x:.4g}" for x in result["place"]), 1e3 * result["tolerance"]
     yield (
-        f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m. In the model it stays within "
-        f"{1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s (position_tolerance: "
-        f"{asked:g} mm). No point of the object is then faster than {1e3 * result['swing']:.3g} mm/s."
+        f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m in the world. In the model it "
+        f"stays within {1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s "
+        f"(position_tolerance: {asked:g} mm). No point of the object is then faster than "
+        f"{1e3 * result['swing']:.3g} mm/s (point_rest_speed_tolerance: {1e3 * result['speed_tolerance']:g} mm/s)."
     )
     if result["off_path"] is not None:
         yield f"During the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints."
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z (one standard deviation)."
+        known = f"(one standard deviation; position_tolerance: {asked:g} mm)"
+        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}."
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
-        yield "The uncertainty of the position is unknown. To get it, set plan.parameter_run_folder to a `solve` run."
+        said = "The uncertainty of the position is unknown, because the plan uses initial values, not estimates. To get"
+        yield f"{said} it, set plan.parameter_run_folder to a `solve` run."
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -360,8 +363,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
     count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
-    said = f"A recording of this motion would determine {count} to within 10 % of their value: {names}."
-    yield f"{said if found else 'No parameter would be known to within 10 %.'} The table has the expected ±."
+    said = f"would determine {count} to within 10 % of their value: {names}"
+    said = said if found else "alone would determine no parameter to within 10 % of its value"
+    small = {name for name, own in result["parameters"].items() if (own["std_relative_together"] or 1.0) <= 0.1}
+    more = abbreviated_names_text(sorted(small.difference(found)))
+    both = f" Together with the existing recordings, it would also determine {more}." if more else ""
+    yield f"A recording of this motion {said}.{both} The table has the expected ±."
     yield SummaryTable(rows, "Expected precision")
     rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
     for own in result["distances"]:
@@ -369,10 +376,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f", with {gains[0]:.3g} nat (the others: {gains[-1]:.3g} to {gains[1]:.3g} nat)" if len(gains) > 1 else ""
-    more = f" Judged by the configured model, it is the best of {len(starts)} searches{others}." * (len(starts) > 1)
-    gain = f"from {best['first']:.3g} to {best['value']:.3g} nat (0.7 nat more halves one standard deviation)"
-    yield f"The search raised the information of the motion {gain}.{more}" if best["value"] > best["first"] else ""
+    others = f"; it is the best of {len(starts)} searches, the next has {gains[1]:.3g} nat" if len(gains) > 1 else ""
+    yield (
+        f"By the model that `solve` uses, the motion has {best['judged']:.3g} nat of information (0.7 nat more halves "
+        f"one standard deviation{others}). By the simpler model of the search, it has {best['value']:.3g} nat; the "
+        f"random motion at its start has {best['first']:.3g} nat."
+    )
     reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
     yield f"The motion reaches {text}."
@@ -523,8 +532,10 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         rows, seen = own["rows"], own["seen"]
         if seen is None or not rows:
             sight = ""
+        elif len(seen) == len(rows):
+            sight = "all"
         else:
-            sight = "all" if len(seen) == len(rows) else _row_names_text(seen) or "none"
+            sight = _row_names_text(seen) or "none"
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, LIMIT_VIOLATION_RATIO_CAP, mean_sample_rate
 from yid_ocp.display import abbreviated_names_text, count_with_noun
@@ -237,10 +239,10 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 def recording_summary_lines(recording: Recording) -> list[str]:
     """Return lines of text that describe a recording: a table of its groups, the duration and notes."""
-    rows: TableRows = [("group", "samples", "rate [Hz]", "length [s]", "channels", "names")]
+    rows: TableRows = [("group", "samples", "rate [Hz]", "longest gap [s]", "length [s]", "channels", "names")]
     for group in recording.all_groups:
-        rate, span = mean_sample_rate(group.t), f"{group.t[-1] - group.t[0]:.4g}"
-        sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", span
+        rate, gap, span = mean_sample_rate(group.t), np.diff(group.t).max(initial=0.0), group.t[-1] - group.t[0]
+        sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", f"{gap:.3g}", f"{span:.4g}"
         names = abbreviated_names_text(group.names, math.inf)
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
     return [*aligned_table_lines(rows), "", f"duration: {recording.duration:g} s", *_note_lines(recording.notes)]

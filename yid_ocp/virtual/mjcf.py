@@ -326,7 +326,8 @@ def _bodies(
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
             SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
-            what, hint = "more than six joints in series have no mass between them", "give one of the links a mass"
+            names = ", ".join(own.get("name", "") for own in elements[j].findall("joint"))
+            what, hint = f"seven joints in series have no mass between them: {names}", "give one of the links a mass"
             allowed = "up to six joints in series, with a mass on the link of the last one"
             raise ModelError(what, where=f"joint '{joint.name}'", allowed=allowed, hint=hint)
         body = merge_inertias(joint.bodies)
@@ -346,9 +347,10 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     for joint in tree.joints:
         shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
-            what, where = "the ratio of weight to mass differs between bodies of one joint", f"joint '{joint.name}'"
+            said = ", ".join(f"{share:.4g}" for share in sorted(shares))
+            what, where = f"bodies of one joint have {said} times the weight of their mass", f"joint '{joint.name}'"
             hint = "leave out one of the effects that change weights (model.effects)"
-            raise ModelError(what, where=where, allowed="one ratio for all bodies of a joint", hint=hint)
+            raise ModelError(what, where=where, allowed="one factor for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
     return tree.with_gravity_fraction(None), weights
 
@@ -462,7 +464,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             key, what = f"parameters.{joint}.servo_dead_band.initial", f"servo '{joint}' has a dead band, MuJoCo none"
             raise ModelError(what, where=key, allowed="0", hint=f"add --set {key}=0")
     if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave the effect on the clock out"
+        what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave out the effect clock_scale"
         raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)
 
 

@@ -154,9 +154,14 @@ def simulate_in_mujoco(
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
-        allowed = f"a motion of the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed"
-        what, hint = "the motion does not move exactly the driven joints", "pass a motion of all driven joints"
-        raise ModelError(what, where=f"motion of {', '.join(motion.joints) or 'nothing'}", allowed=allowed, hint=hint)
+        lacking = ", ".join(name for name in system.driven if name not in motion.joints)
+        what = (
+            f"the motion lacks the driven joints {lacking}" if lacking else f"the motion has {', '.join(motion.joints)}"
+        )
+        what = f"{', '.join(system.prescribed)} are prescribed, not driven joints" if system.prescribed else what
+        allowed = f"a motion of {', '.join(system.driven) or 'driven joints'} in this order, and no prescribed joint"
+        hint = "make the motion for `system.driven`, of a system with model.arms.mode: driven or servo"
+        raise ModelError(what, where="motion.joints and system", allowed=allowed, hint=hint)
     mujoco = import_mujoco()
     model = mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
@@ -181,8 +186,9 @@ def simulate_in_mujoco(
         result = _play(scene, controller, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
-        hint = f"pass a time_step shorter than {chosen.time_step:g} s, or a slower motion"
-        raise ModelError("the simulation diverged", where="MuJoCo", allowed="finite positions and efforts", hint=hint)
+        hint = f"pass a time_step below {chosen.time_step:g} s, or a slower motion"
+        where = f"MuJoCo, {lost or 'efforts'}"
+        raise ModelError("the simulation diverged", where=where, allowed="finite positions and efforts", hint=hint)
     return result
 
 
@@ -236,9 +242,11 @@ def _settling_model(scene: MujocoModelAndState, damping: Array) -> Any:
     return held
 
 
-def _lost(scene: MujocoModelAndState) -> bool:
+def _lost(scene: MujocoModelAndState) -> str:
+    """The joint at which the simulation became unstable, as in "joint 'elbow'". Empty if it did not."""
     kinds = scene.mujoco.mjtWarning
-    return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _INSTABILITY_WARNINGS)
+    found = (scene.data.warning[int(getattr(kinds, name))] for name in _INSTABILITY_WARNINGS)
+    return next((f"joint '{scene.model.joint(own.lastinfo).name}'" for own in found if own.number > 0), "")
 
 
 class TrackingController:
@@ -328,11 +336,13 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
         held.eq_solref[:, 0] = np.maximum(firm[:, 0], 2 * DEFAULT_SIMULATOR_TIME_STEP)
         step(held, data, nstep=block)
         held.eq_solref[:] = firm
-    for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
-        if _lost(scene):
-            what = "the simulation diverged before the motion began, while the object settled"
-            hint = "start with joint angles nearer to the grasp, or simulate with a shorter time step"
-            raise ModelError(what, where="MuJoCo", allowed="finite positions and velocities", hint=hint)
+    every = block * held.opt.timestep
+    for done in range(1, 1 + math.ceil(_SETTLING_LIMIT / every)):
+        if lost := _lost(scene):
+            what = "the simulation diverged before the motion began, "
+            what += f"within {done * every:.3g} s of settling with time steps of {held.opt.timestep:g} s"
+            hint = "begin nearer to the grasp (initial_joint_angles), or simulate with a shorter time step"
+            raise ModelError(what, where=f"MuJoCo, {lost}", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
     what = f"the object still moves at {calm:.2g} rad/s after {_SETTLING_LIMIT:g} s of settling (limit {_REST:g} rad/s)"
@@ -467,7 +477,7 @@ class _Played:
     t: Array
     values: Array
     points: Array
-    has_diverged: bool
+    diverged_at: str
 
 
 def _step_times(scene: MujocoModelAndState, end: float) -> Array:
@@ -486,7 +496,8 @@ def _played(scene: MujocoModelAndState, end: float, control: Callable[[int, floa
         if (own := control(k, t)) is not None:
             values[k] = own
         mujoco.mj_step(model, data)
-    return _Played(times, values, points, _lost(scene) or not (np.isfinite(values).all() and np.isfinite(points).all()))
+    is_finite = np.isfinite(values).all() and np.isfinite(points).all()
+    return _Played(times, values, points, _lost(scene) or ("" if is_finite else "efforts"))
 
 
 def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | None) -> _Played:
@@ -528,9 +539,10 @@ def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: A
 def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, ReplayErrorAgainstRecording]:
-    if played.has_diverged:
+    if played.diverged_at:
         what, hint = "the replay in MuJoCo diverged", "set a smaller `timestep` under `option` in the MJCF text"
-        raise ModelError(what, where=f"recording '{recording.name}'", allowed="finite positions and efforts", hint=hint)
+        where = f"recording '{recording.name}', {played.diverged_at}"
+        raise ModelError(what, where=where, allowed="finite positions and efforts", hint=hint)
     found, t = dict[str, ReplayErrorAgainstRecording](), joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9
     if not system.driven:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp import files
 from yid_ocp.arrays import Array
+from yid_ocp.data.recording import raise_data_error_unless
 from yid_ocp.errors import DataError, OutputError, require_known_names
 from yid_ocp.vision import frames
 
@@ -57,10 +58,12 @@ def _read_npz(path: Path) -> _Cloud:
         raise _damaged(path, "it is damaged, or not an NPZ file") from error
     points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        what, hint = f"the file has no array `{_POINTS_ARRAY}` of points", "write it with numpy.savez(FILE, points=xyz)"
+        found = "missing" if points is None else f"of type {points.dtype} and shape {points.shape}, not numbers (N, 3)"
+        what, hint = f"the array `{_POINTS_ARRAY}` is {found}", "write it with numpy.savez(FILE, points=xyz)"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        what, hint = f"the array `{_COLOURS_ARRAY}` is not one RGB colour per point", "write uint8, or leave it out"
+        what = f"the array `{_COLOURS_ARRAY}` has type {colours.dtype} and shape {colours.shape}"
+        hint = f"write uint8 of shape {points.shape}, or leave `{_COLOURS_ARRAY}` out"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     return points.astype(np.float64), colours
 
@@ -71,7 +74,7 @@ def _read_xyz(path: Path) -> _Cloud:
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
     except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise _damaged(path, "it is not a table with numbers x y z in every row") from error
+        raise _damaged(path, f"it is not a table of numbers x y z ({error})") from error
     if rows.shape[0] and rows.shape[1] < 3:
         raise _damaged(path, f"it has {rows.shape[1]} columns, but needs x, y and z")
     seen = rows[:, 3:6]
@@ -137,7 +140,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
             body = body[count * sum(np.dtype(kind).itemsize for _, kind in columns) :]
         else:
             body = b"\n".join(body.split(b"\n")[min(count, len(body)) :])
-    raise _damaged(path, "it has no vertices")
+    raise _damaged(path, "its header has no line 'element vertex NUMBER', so it has no points")
 
 
 def _damaged(path: Path, why: str) -> DataError:
@@ -150,7 +153,7 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
     """Byte order (empty for ASCII) and elements, in file order, that the header `text` of a PLY file declares."""
     order: str | None = None
     found: list[_Element] = []
-    for line in text.splitlines()[1:]:
+    for number, line in enumerate(text.splitlines()[1:], start=2):
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
@@ -163,9 +166,9 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
             case ["property", kind, name] if found and kind in _NUMPY_TYPES:
                 found[-1][2].append((name, _NUMPY_TYPES[kind]))
             case _:
-                raise _damaged(path, f"this line of its header is wrong: {line[:60]!r}")
+                raise _damaged(path, f"line {number} of its header is no known declaration: {line[:60]!r}")
     if order is None:
-        raise _damaged(path, "its header has no format")
+        raise _damaged(path, "its header has no format, such as the line 'format ascii 1.0'")
     return order, found
 
 
@@ -174,24 +177,29 @@ def _vertices(
 ) -> _Cloud:
     names, kinds = zip(*columns, strict=True) if columns else ((), ())
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
-        raise _damaged(path, "its vertices lack x, y or z, contain lists, or name a property twice")
+        held = ", ".join(name if kind else f"{name} (a list)" for name, kind in columns) or "no properties"
+        raise _damaged(path, f"its vertices have {held}, but need x, y and z, each property once, and no list")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
         raise _damaged(path, f"it is cut off and has only {len(body)} bytes for {count} points")
     if not count:
-        raise _damaged(path, "it has no vertices")
+        raise _damaged(path, "its header states 0 vertices (points)")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
     if order:
         rows = np.frombuffer(body, [(n, order + k) for n, k in columns], count)
         values = np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
     else:
-        try:
-            lines = [line.split() for line in body.split(b"\n", count)[:count]]
-            values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
-        except (ValueError, IndexError) as error:
-            raise _damaged(path, f"a vertex differs from the header ({error})") from error
+        lines = [line.split() for line in body.split(b"\n", count)[:count]]
+        values = np.empty((len(lines), len(wanted)))
+        for i, row in enumerate(lines):
+            try:
+                values[i] = [float(row[names.index(name)]) for name in wanted]
+            except (ValueError, IndexError) as error:
+                at = path.read_bytes().count(b"\n") - body.count(b"\n") + i + 1
+                text, held = b" ".join(row)[:60].decode("latin-1"), ", ".join(names)
+                raise _damaged(path, f"line {at} (point {i + 1}) is '{text}', but needs numbers for {held}") from error
     if len(values) < count:
-        raise _damaged(path, f"it has {len(values)} of the {count} vertices that its header states")
+        raise _damaged(path, f"it has only {len(values)} of the {count} points that its header states")
     return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
 
 
@@ -206,10 +214,8 @@ def read_frame_folder(
 ) -> frames.FrameSequence:
     """Read a folder of point clouds or depth images as a frame sequence, one frame at a time.
 
-    `camera.json` (`yid-frames/1`) holds `pose` (4x4), `frame` ("camera" or "world") and `unit` ("m" or "mm") of clouds,
-    `intrinsics` and `depth_unit` [m] of depth images. `timestamps.csv` has the columns `file` and `t` [s]. The files
-    are PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order; each is read on demand. The arguments
-    `pose` (4, 4) and `unit` replace the folder's values. Raises `DataError` if an entry is missing or invalid.
+    docs/howto/vision.md has the files and keys of such a folder. The arguments `pose` (4, 4) and `unit` replace the
+    folder's values. Raises `DataError` if an entry is missing or invalid.
     """
     path = Path(folder)
     if not path.is_dir():
@@ -273,9 +279,9 @@ def _read_camera(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     head = files.read_input_json(path)
-    if not isinstance(head, dict):
-        what, hint = "the file holds no JSON object {...}", 'write for example {"pose": [[...], ...], "unit": "m"}'
-        raise DataError(what, where=str(path), allowed=f"an object with {', '.join(_CAMERA_FILE_KEYS)}", hint=hint)
+    what, hint = "the file holds no JSON object {...}", 'write for example {"pose": [[...], ...], "unit": "m"}'
+    allowed = f"an object with {', '.join(_CAMERA_FILE_KEYS)}"
+    raise_data_error_unless(isinstance(head, dict), what, str(path), allowed, hint)
     require_known_names(head, _CAMERA_FILE_KEYS, "key", str(path), DataError)
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         what = f"the format of the frames is '{head['format']}', which this version of yid_ocp does not read"
@@ -288,9 +294,8 @@ def _check_kinds(names: Sequence[str], folder: Path, intrinsics: frames.CameraIn
     known = (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
     for name in names:
         kind = Path(name).suffix.lower()
-        if kind not in known:
-            what, hint = f"'{name}' is neither a cloud nor a depth image", "convert the file, or remove its row"
-            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known), hint=hint)
+        what, hint = f"'{name}' is neither a cloud nor a depth image", "convert the file, or remove its row"
+        raise_data_error_unless(kind in known, what, str(folder / STAMP_FILE), ", ".join(known), hint)
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
             what, hint = f"the intrinsics of the camera are missing, which '{name}' needs", "add the key `intrinsics`"
             allowed = '"intrinsics": {"width": 640, "height": 480, "fx": 577, "fy": 577, "cx": 319.5, "cy": 239.5}'
@@ -304,8 +309,8 @@ def _intrinsics(entry: object, where: str) -> frames.CameraIntrinsics | None:
     needed, bent = known[:6], known[6:]
     if not isinstance(entry, dict) or set(entry) - set(bent) != set(needed):
         allowed = f"{', '.join(needed)}; for a lens with distortion {', '.join(bent)} as well"
-        odd = sorted(set(needed) ^ ((set(entry) if isinstance(entry, dict) else set()) - set(bent)))
-        what, hint = f"keys of the intrinsics are missing or unknown: {', '.join(odd)}", "add or remove these keys"
+        lacking = ", ".join(sorted(set(needed) - set(entry if isinstance(entry, dict) else ()))) or "none"
+        what, hint = f"keys of the intrinsics are missing ({lacking}) or unknown", "add or remove these keys"
         raise DataError(what, where=f"{where}: intrinsics", allowed=allowed, hint=hint)
     width, height, fx, fy, cx, cy = (_number(entry[name], f"intrinsics.{name}", where) for name in needed)
     coefficients = entry.get("coefficients", ())
@@ -326,17 +331,14 @@ def _number(value: object, name: str, where: str) -> float:
 
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     allowed, hint = "CSV with the columns file, t [s]", "write the row file,t and one for each frame, as 0.ply,0.033"
-    if not path.exists():
-        raise DataError("the file of time stamps does not exist", where=str(path), allowed=allowed, hint=hint)
+    raise_data_error_unless(path.exists(), "the file of time stamps does not exist", str(path), allowed, hint)
     try:
         rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
     except csv.Error as error:
         raise DataError(f"the file is not CSV: {error}", where=str(path), allowed=allowed, hint=hint) from error
-    if not rows:
-        raise DataError("the table of time stamps has no rows", where=str(path), allowed=allowed, hint=hint)
-    if not {"file", "t"} <= set(rows[0]):
-        what, hint = f"the columns are {', '.join(map(str, rows[0]))}, not file and t", "rename them to file and t"
-        raise DataError(what, where=f"{path}, line 1", allowed=allowed, hint=hint)
+    raise_data_error_unless(rows, "the table of time stamps has no rows", str(path), allowed, hint)
+    what, hint = f"the columns are {', '.join(map(str, rows[0]))}, not file and t", "rename them to file and t"
+    raise_data_error_unless({"file", "t"} <= set(rows[0]), what, f"{path}, line 1", allowed, hint)
     times = []
     for number, row in enumerate(rows, start=2):
         try:

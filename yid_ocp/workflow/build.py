@@ -441,14 +441,18 @@ def marker_position_values_by_recording(
         group = recording.points[0].names if recording.points else ()
         if recording.marker_reference_pose is None:
             hint = f"record them, or give model.frames.{names[0]}.xyz in place of use_recorded_straight_position: true"
-            what = "the recording has no marker positions of the straight object"
+            what = f"the recording has no marker positions of the straight object, from which {names[0]} is placed"
             allowed = "a dataset `straight`: positions of all points of the first group, shape (np, 3) [m]"
             raise DataError(what, where=f"recording '{recording.name}': straight", allowed=allowed, hint=hint)
         found[recording.name] = {}
         for name, pose in zip(names, placed, strict=True):
             if name not in group:
-                what = f"'{name}' is not a point of recording '{recording.name}'"
-                raise run.config_error(what, "model", "frames", name, **unknown_name_error_arguments(name, group))
+                what = f"the frame {name} takes its position from the recorded point of this name, which recording "
+                what += f"'{recording.name}' lacks"
+                hint = "rename the frame to a recorded point, or set xyz: [x, y, z] in place of "
+                hint += "use_recorded_straight_position"
+                allowed = unknown_name_error_arguments(name, group)["allowed"]
+                raise run.config_error(what, "model", "frames", name, allowed=allowed, hint=hint)
             local = pose[:3, :3].T @ (recording.marker_reference_pose[group.index(name)] - pose[:3, 3])
             found[recording.name] |= {f"{name}.{axis}": float(x) for axis, x in zip(_AXES, local, strict=True)}
     return found

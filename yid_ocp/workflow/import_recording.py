@@ -67,7 +67,9 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
-    print_result(arguments, result, lambda: [*recording_summary_lines(recording), *issues], f"recording: {out}", out)
+    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
+    lines = [*recording_summary_lines(recording), *issues, "", then]
+    print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
 
 

@@ -167,7 +167,8 @@ def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
     own = attributes_to_dict(found, f"{names} std=end_position_std evaluations=n_evaluations")
     asked = {"point": run.plan.point, "tolerance": run.plan.position_tolerance}
-    return own | asked | {"time_step": found.simulator.step.time_step}
+    speeds = {"speed_tolerance": run.plan.point_rest_speed_tolerance}
+    return own | asked | speeds | {"time_step": found.simulator.step.time_step}
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:

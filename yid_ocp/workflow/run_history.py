@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from yid_ocp.config.schema import RENAMED_NAMES_HINT
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import attributes_to_dict, file_sha256, is_file, read_input_json
 from yid_ocp.model.objects import ObjectBuilder
@@ -140,8 +140,8 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[run_estimates.RunE
             what, hint = f"the baseline run {folder} is given twice", "leave one of the two out"
             raise run.config_error(what, *where, allowed="every baseline run once", hint=hint)
         if differing := _difference(run, _settings(folder)):
-            what = f"{folder} is a run of another model: model.{differing} differs"
-            hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
+            what = f"{folder} is a run of another model: {differing}"
+            hint = f"compare `model` with {Path(folder) / 'config.yaml'}, or choose another baseline run"
             raise run.config_error(what, *where, allowed=_SAME_MODEL, hint=hint)
         found.append(own)
     if dependent := _dependent(run.diagnosis.baseline_run_folders):
@@ -168,14 +168,13 @@ def require_runs_of_one_model(folders: Sequence[Path]) -> None:
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
         if differing := _difference(known[0][1], settings):
-            what = f"the runs are of different models: model.{differing} is not that of {known[0][0]}"
-            allowed = f"{_SAME_MODEL} as in {known[0][0]}"
-            hint = "give runs of one model. Two models can only be compared by runs of the same recordings"
-            raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed, hint=hint)
+            what = f"{folder} is a run of another model than {known[0][0]}: {differing}"
+            hint = "give runs of one model; or, to compare two models, two runs of the same recordings"
+            raise ConfigError(what, where=str(folder / "config.yaml"), allowed=_SAME_MODEL, hint=hint)
 
 
 def _difference(run: RunSettings, there: RunSettings | None) -> str:
-    """Return the first section of `model` that differs between two runs. Empty if none differs, or `there` is None."""
+    """Say which key of `model` differs first between two runs. Empty if none differs, or `there` is None."""
     if there is None:
         return ""
     for key in _COMPARED_MODEL_SECTIONS:
@@ -185,8 +184,20 @@ def _difference(run: RunSettings, there: RunSettings | None) -> str:
         if isinstance(here, ObjectBuilder) and isinstance(other, ObjectBuilder):
             here, other = here.with_file_names_instead_of_paths(), other.with_file_names_instead_of_paths()
         if here != other:
-            return key
+            return _first_difference(f"model.{key}", here, other)
     return ""
+
+
+def _first_difference(key: str, here: Any, there: Any) -> str:
+    if is_dataclass(here) and type(here) is type(there):
+        here, there = vars(here), vars(there)
+    if isinstance(here, tuple) and isinstance(there, tuple) and any(map(is_dataclass, here)):
+        here, there = dict(enumerate(here)), dict(enumerate(there))
+    if isinstance(here, Mapping) and isinstance(there, Mapping):
+        name = next(name for name in (*here, *there) if here.get(name) != there.get(name))
+        return _first_difference(f"{key}.{name}", here.get(name), there.get(name))
+    own = (getattr(value, "kind", "set") if is_dataclass(value) else value for value in (there, here))
+    return f"{key} is {' instead of '.join('not set' if value is None else str(value)[:60] for value in own)}"
 
 
 def _settings(folder: str | Path) -> RunSettings | None:
@@ -318,8 +329,11 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:
-        what, allowed = "the runs predict no common channel of a sensor", "one common channel or more"
-        raise DataError(what, where=str(folders[1]), allowed=allowed, hint="compare runs that use the same sensors")
+        names = (abbreviated_names_text(list(dict.fromkeys(name for _, name in own))) for own in known)
+        said = (f"{label} predicts {own or 'nothing'}" for label, own in zip(labels, names, strict=True))
+        what = f"the runs predict no common channel: {', '.join(said)}"
+        allowed, hint = "one common channel or more", "compare runs that use the same `sensors`. No report was written"
+        raise DataError(what, where=f"{folders[0]} and {folders[1]}", allowed=allowed, hint=hint)
     pairs.sort(key=lambda pair: "estimate" in roles[pair[0].recording])
     channels = [
         {

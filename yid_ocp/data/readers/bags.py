@@ -175,12 +175,8 @@ def _read_bag(
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    Joints come from `sensor_msgs/JointState`; several topics are merged on one clock. In files without `JointState`,
-    joints come from Franka's `FrankaState` and `FrankaRobotState` (with the estimated wrench as `wrist_estimated`),
-    `DynamicJointState` and `JointTrajectoryControllerState` of `control_msgs`, or `RobotStateRTMsg` of `ur_msgs`.
-    `joint_topics` selects these topics even if there is a `JointState`, and `message_fields` reads messages of any
-    type. Stamped points, poses and transforms of `geometry_msgs` and frames of `/tf` become points, one group per
-    reference frame. Each topic of `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
+    docs/reference/import_formats.md has the types of messages. Points have one group per reference frame. Each topic of
+    `WrenchStamped` or `Imu` becomes a group `wrist` or `imu` at the frame of its header.
 
     Times are header stamps, relative to the first message. If any message has no stamp, all times are recording times.
     A message that repeats time and values of the previous one counts once. A joint channel that is empty or all NaN is
@@ -409,7 +405,7 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         messages = [message for message in bag.states if message.source == topic]
         sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
         if wanted is None and len(sets) > 1:
-            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints of one set"
+            what, hint = f"the {len(messages)} messages have {len(sets)} different sets of joints", "choose one set"
             allowed = "one of the sets: " + "; ".join(", ".join(names) for names in sets.values())
             raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=f"{hint}: --joints NAME,NAME")
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
@@ -426,7 +422,8 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
         kept = [message for message in messages if set(names) <= set(message.content.name)]
         if not kept or not names:
             allowed, hint = f"messages with {', '.join(names) or 'the joints'}", "choose another --command-topic TOPIC"
-            raise DataError(f"no message of '{command}' has all joints", where=where, allowed=allowed, hint=hint)
+            what = f"none of the {len(messages)} messages of '{command}' has all joints"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
         found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 
@@ -446,7 +443,7 @@ def _check_together(bag: _Contents, topics: Sequence[str], wanted: Mapping[str, 
             raise DataError(f"the bag has no joint '{name}'", where=where, allowed=allowed, hint=hint)
     got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
     if got != set(wanted):
-        what, allowed = "no message has all the chosen joints", f"joints of one of these sets: {allowed}"
+        what, allowed = f"no message has all of {', '.join(wanted)}", f"joints of one of these sets: {allowed}"
         raise DataError(what, where=where, allowed=allowed, hint="choose joints of one set: --joints NAME,NAME")
 
 
@@ -477,6 +474,7 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
                 rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
                 what = f"a message has {len(values)} values of '{channel}' for {len(own)} joints"
+                what += f", {seconds(message):.4g} s after the first message"
                 hint = "correct the node that publishes the topic, or choose another topic with --joint-topic"
                 raise DataError(what, where=where, allowed="one value for each joint, or none", hint=hint)
         if rows and len(rows) < len(states):
@@ -487,7 +485,8 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
             channels[channel] = np.array(rows)
     if "position" not in channels:
         allowed, hint = "messages whose `position` is filled", "choose another topic: --joint-topic TOPIC"
-        raise DataError("the joint states have no positions", where=where, allowed=allowed, hint=hint)
+        what = f"the {len(states)} joint states have no positions"
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
     values = np.hstack([t[:, None], *channels.values()])
     own = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))  # a message that is sent twice counts once
     return JointGroup(entry.wanted, t[own], **{name: values[own] for name, values in channels.items()})

@@ -120,7 +120,7 @@ def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str
             allowed, hint = "NAME, or RECORDED=NAME of a joint", "write for example --joints q1=shoulder,q2=elbow"
             raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
         if recorded in found or name in found.values():
-            what, allowed = f"the joint '{name}' is chosen twice", "every joint once"
+            what, allowed = f"the joint '{recorded if recorded in found else name}' is chosen twice", "every joint once"
             raise DataError(what, where=where, allowed=allowed, hint="remove one of its two entries in --joints")
         found[recorded] = name
     return found
@@ -155,8 +155,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         elif options.torque_constants or options.gear_ratios:
-            what, allowed = "torque constants or gear ratios are given, but there are no efforts", "both with efforts"
-            raise DataError(what, where=where, allowed=allowed, hint="leave them out, or give the efforts")
+            what, hint = "torque constants or gear ratios are given, but the file has no efforts", "leave them out"
+            raise DataError(what, where=where, allowed="both with efforts", hint=hint)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen, chosen = list[PointGroup](), options.point_names
     for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):

@@ -48,10 +48,8 @@ def _read_c3d(
 
     C3D has no time stamps: the times are frame index / rate from zero, a `nominal` clock. The file states rate and
     unit; `units` overrides the unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin) is
-    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `point_names` maps the markers to
-    keep to new names; by default all labelled markers that were ever seen are kept. `notes` lists omitted content:
-    unlabelled markers, results of a body model (angles, forces, moments, powers) and analog channels. Raises
-    `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
+    NaN. A subject prefix of a name (`Subject:tip`) is removed if the rest is unique. `notes` lists omitted content.
+    Raises `DataError` without `ezc3d`, for an unreadable file, without markers, or `validated_recording` refuses it.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -95,8 +93,8 @@ def _markers(path: Path) -> _Markers:
         computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise _unreadable(path) from error
-    what = "the C3D file has no frames or no frame rate" if labels else "the C3D file has no labelled markers"
-    allowed, hint = "labelled 3-D points and their frame rate", "label the markers, and export their trajectories again"
+    what = f"the C3D file has {len(position)} frames at {rate:g} Hz, and {len(labels)} labelled markers"
+    allowed, hint = "all three above 0", "label the markers, and export their trajectories again"
     raise_data_error_unless(rate > 0 and len(position) and labels, what, str(path), allowed, hint)
     what, known = f"the unit of the markers is '{unit}', which is unknown", ", ".join(_LENGTH_UNITS)
     raise_data_error_unless(unit in ("", *_LENGTH_UNITS), what, str(path), known, "export the file again in mm")

@@ -67,19 +67,9 @@ _DEFAULTS = _CsvOptions()
 def _read_csv(path: str | os.PathLike[str], options: _CsvOptions = _DEFAULTS) -> Recording:
     """Read a recording from a CSV table with one row per time. Its points become one group `points`.
 
-    Columns are recognised by name, optionally with a unit (`time [ms]`, `q1_deg`):
-
-    - time: `t`, `time`, `timestamp`
-    - joints: `q_<joint>`, `position_<joint>`, `velocity_<joint>`, `effort_<joint>` and so on, or the spelling of other
-      loggers: `pos_<joint>`, `<joint>.vel`, `tau1`, `dq1`, `tau_J[0]`, `/joint_states/<joint>/effort`
-    - sensors on a link: `<sensor>_Q_x` with Q = force, torque, angular_velocity, specific_force
-    - points: `<point>_x`, `<point>_y`, `<point>_z`
-
-    Exports of Motive (OptiTrack), Nexus (Vicon) and QTM (Qualisys) are recognised by their headers, which also state
-    the unit of their points. An empty cell is NaN. Lines that begin with `#` are comments. Numbers may have a decimal
-    comma, times may be time stamps of ISO 8601 (date and time of day). The joints, the points or a sensor have no
-    sample at a time if all their cells in this row are empty. Raises `DataError` if the file, a column,
-    cell, option or unit cannot be understood, or if `validated_recording` refuses the result.
+    docs/reference/import_formats.md has the names of columns and the forms of numbers. Exports of Motive, Nexus and QTM
+    are recognised by their headers. The joints, the points or a sensor have no sample at a time if all their cells in
+    this row are empty. Raises `DataError` if anything cannot be understood, or `validated_recording` refuses it.
     """
     path = Path(path)
     said = options.description, path.name, path.stem, file_sha256(path)
@@ -278,10 +268,11 @@ def _table_rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
 
 def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
     """Lines of a file. Raises `DataError` for a line longer than the limit."""
-    while line := file.readline(_MAX_LINE_LENGTH + 1):
+    for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE_LENGTH + 1), ""), start=1):
         if len(line) > _MAX_LINE_LENGTH:
-            what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
-            raise DataError(what, where=str(path), allowed=allowed, hint="export the measurements again as CSV")
+            what, where = f"the line has more than {_MAX_LINE_LENGTH} characters", f"{path}, line {number}"
+            hint = "export the measurements again as CSV"
+            raise DataError(what, where=where, allowed="one row of numbers per line", hint=hint)
         yield line
 
 
@@ -318,7 +309,8 @@ def _read_table(
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        notes = (f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})",)
+        said = f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})"
+        notes = (f"{said}. Of the first, {next(iter(bad.values()))}. The recording has no samples at their times",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
@@ -333,7 +325,7 @@ def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> No
     raise_data_error_unless(len(header) > 1, f"the table has one column, '{header[0]}'", str(path), _ALLOWED, hint)
     name, count = Counter(header).most_common(1)[0] if options.has_header else ("", 1)
     allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
-    raise_data_error_unless(count == 1, f"two columns are called '{name}'", where, allowed, hint)
+    raise_data_error_unless(count == 1, f"{count} columns are called '{name}'", where, allowed, hint)
 
 
 def _is_number(cell: str) -> bool:

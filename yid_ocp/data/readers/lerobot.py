@@ -35,7 +35,7 @@ _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_inde
 _NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
 """Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
 _MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
-_PERCENT = "recorded as 0 to 100 % of its calibrated range"
+_PERCENT = "recorded as 0 to 100 % of its calibrated range, not as an angle"
 
 
 class _Feature(BaseModel):
@@ -71,13 +71,9 @@ def _read_lerobot_episode(
 ) -> Recording:
     """Read one episode, counted from zero, from the folder of a LeRobot dataset.
 
-    `observation.state` is the measured position of the joints. If the names of its entries end in `.pos`, `.vel` and
-    `.torque`, `.effort` or `.current`, it is position, velocity and effort. `action` is the commanded position. Times
-    are frame index / frame rate, a nominal clock. `units` must state the unit of angles (often degrees) if they cannot
-    be radians, or if LeRobot never records this robot in radians. With degrees, a gripper is left out, because LeRobot
-    records it in per cent of its range. `notes` lists images and other features. The other
-    options are those of `JointPointAndUnitOptions`; `joints` can omit a gripper that is not in the model. Raises
-    `DataError` without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
+    docs/reference/import_formats.md has the features and their units. Times are frame index / frame rate, a nominal
+    clock. `notes` lists images and other features. Options are those of `JointPointAndUnitOptions`. Raises `DataError`
+    without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
@@ -85,7 +81,8 @@ def _read_lerobot_episode(
     t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
     where = f"{dataset.folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
-        left |= dict.fromkeys(_grippers(names), f"{_PERCENT}, so state a fixed angle in model.arms.locked_joints")
+        advice = "if the model has this joint, set model.arms.locked_joints"
+        left |= {name: f"{_PERCENT}; {advice}: {{{name}: ANGLE}} [rad]" for name in _grippers(names)}
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
     group = JointGroup(names, t - t[0], clock="nominal", **channels)
@@ -198,7 +195,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
         if len(found["frame_index"]):
             return found, file
     what, hint = f"no file of the dataset has episode {episode}", "download the whole dataset, with all episodes"
-    raise DataError(what, where=where, allowed=allowed, hint=hint)
+    raise DataError(what, where=where, allowed="an episode whose file is in the folder", hint=hint)
 
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
@@ -217,7 +214,8 @@ def _files(dataset: _Dataset, episode: int) -> list[Path]:
     where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
     allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
     hint = "write data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-    raise DataError(f"data_path is '{pattern}', which is not usable", where=where, allowed=allowed, hint=hint)
+    what = f"data_path is '{pattern}', which does not lead to the file of an episode"
+    raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
@@ -254,7 +252,8 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
     channels: dict[str, Any] = {}
     for channel in dict.fromkeys(channel for _, channel in entries):
         at = [entries.index((joint, channel)) for joint in joints if (joint, channel) in entries]
-        what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints"
+        lacking = ", ".join(joint for joint in joints if (joint, channel) not in entries)
+        what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints; it lacks {lacking}"
         allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
         raise_data_error_unless(len(at) == len(joints), what, f"{dataset.folder}: {_STATE}", allowed, hint)
         channels[channel] = state[:, at]
@@ -264,7 +263,7 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:
-            left[name] = f"features of type '{dataset.info.features[name].dtype or 'unknown'}' are not used"
+            left[name] = f"type '{dataset.info.features[name].dtype or 'unknown'}'; only values of joints are imported"
             continue
         values = table[name]
         named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
@@ -278,13 +277,14 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
 def _matrix(column: Any, name: str, folder: Path) -> Array:
     from pyarrow import compute
 
-    rows, n_lengths = len(column), 1
+    rows, lengths = len(column), list[int]()
     while hasattr(column.type, "value_field"):
-        n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
+        lengths = max(lengths, compute.unique(compute.list_value_length(column)).to_pylist(), key=len)
         column = column.flatten()
-    what, allowed = f"the lists of column '{name}' differ in length", "lists of equal length in all frames"
+    what = f"the lists of column '{name}' differ in length ({', '.join(map(str, lengths))} values)"
+    allowed = "lists of equal length in all frames"
     hint = f"remove the frames in which {name} has another length, or convert the dataset again"
-    raise_data_error_unless(n_lengths == 1 and len(column) >= rows, what, str(folder), allowed, hint)
+    raise_data_error_unless(len(lengths) < 2 and len(column) >= rows, what, str(folder), allowed, hint)
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 

@@ -199,7 +199,6 @@ class ObjectBuilder:
     default_link_refinement: ClassVar[bool] = False
     segment_key: ClassVar[str] = "model.object"  # of the settings of a segment, with {} for its name
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {}  # words of `init --object`
-    settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("kind of object")]
 

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
@@ -252,28 +252,6 @@ def _segments(
 @dataclass(frozen=True, kw_only=True)
 class _ClampedCable(CableOptions, ObjectBuilder):
     """A cable (with branches or without) between two clamps that follow measured points, without a robot."""
-
-    settings_examples: ClassVar[Mapping[str, str]] = {
-        "model.object, kind: cable": """\
-model:
-  object:
-    kind: cable
-    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
-    child_branch_vertex_names: {side: [p2, s1, s2]}
-    undeformed_shape_file: undeformed.csv
-    end_clamp_grasp_kind: axis
-""",
-        "model.object.branch_properties_by_name.NAME": """\
-model:
-  object:
-    kind: cable
-    main_branch_vertex_names: [p0, p1, p2, p3, p4, p5]
-    undeformed_shape_file: undeformed.csv
-    child_branch_vertex_names: {side: [p2, s1, s2]}
-    branch_properties_by_name:
-      side: {linear_density: 0.03, has_separate_twist_damping: true}    # [kg/m]
-""",
-    }
 
     kind: Annotated[Literal["cable"], OptionInfo("kind of object")] = "cable"
     main_branch_vertex_names: Annotated[

@@ -45,18 +45,6 @@ class _FoamY(MountedObjectBuilder):
     """The foam letter Y of Caldwell (ISER 2014). Without a mount its foot is at the position of that experiment."""
 
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {"foam_y": InitObjectFactory(4, _init_object)}
-    settings_examples: ClassVar[Mapping[str, str]] = {
-        "model.object, kind: foam_y": """\
-model:
-  object: {kind: foam_y, links: 8}
-""",
-        "model.object.mount": """\
-model:
-  object:
-    kind: foam_y
-    mount: {parent_frame: base, xyz: [0.85, 0.0, -0.93], rpy: [0.0, 0.0, 1.5708]}    # [m], [rad]
-""",
-    }
 
     kind: Annotated[Literal["foam_y"], OptionInfo("kind of object")] = "foam_y"
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of rigid links of every tube")] = 4

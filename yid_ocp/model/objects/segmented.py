@@ -178,25 +178,6 @@ class _SegmentedObject(MountedObjectBuilder):
         "beam": InitObjectFactory(6, _beam),
         "tree": InitObjectFactory(4, _tree, has_branches=True),
     }
-    settings_examples: ClassVar[Mapping[str, str]] = {
-        "model.object, kind: segments": """\
-model:
-  object:
-    kind: segments
-    mount: {parent_frame: tool0}
-    named_segments:
-      trunk: {length: 0.5, mass: 0.05, radius: 0.01}                           # [m], [kg], [m]
-      twig: {parent: trunk, length: 0.3, mass: 0.02, radius: 0.006, rpy: [0.5, 0.0, 0.0]}
-""",
-        "model.object.named_segments.NAME": """\
-model:
-  object:
-    kind: segments
-    named_segments:
-      beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
-values_given_as_rigidities: true, clamped_at_base: true}
-""",
-    }
 
     kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
     mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)

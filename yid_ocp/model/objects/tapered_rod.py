@@ -42,14 +42,6 @@ class _TaperedRod(MountedObjectBuilder):
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {
         "tapered_rod": InitObjectFactory(8, _init_object, _FURTHER_NUMBERS)
     }
-    settings_examples: ClassVar[Mapping[str, str]] = {
-        "model.object, kind: tapered_rod": """\
-model:
-  object: {kind: tapered_rod, length: 1.2, mass: 0.08, base_radius: 0.006, tip_radius: 0.002}    # [m], [kg]
-parameters:
-  rod.bend: {free: true, initial: 20.0}    # [N m^2]
-"""
-    }
 
     kind: Annotated[Literal["tapered_rod"], OptionInfo("kind of object")] = "tapered_rod"
     length: Annotated[float, Gt(0), Le(50), OptionInfo("length from base to tip", "m")]

@@ -169,12 +169,12 @@ def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system, names = found.simulator.step.system, found.joint_names
     if (where := found.point_trajectories.get(findings.result.get("point"))) is not None:
         lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
-        title = "from the place, its tolerance shaded [mm]"
+        title = f"{findings.result['point']}, from its target [mm] (grey: tolerance)"
         yield "", lines_over_time_figure(TimePlotData(title, lines, band_half_height=1e3 * tolerance))
     for words, channel, values in (
-        ("joints, from the start", "position", found.joint_positions - found.joint_positions[0]),
-        ("velocity", "velocity", found.joint_velocities),
-        ("effort", "effort", found.joint_efforts),
+        ("joint positions, from the start", "position", found.joint_positions - found.joint_positions[0]),
+        ("joint velocities", "velocity", found.joint_velocities),
+        ("joint efforts", "effort", found.joint_efforts),
     ):
         title = f"{words} [{_joint_channel_unit(system, names, channel)}]"
         yield "", lines_over_time_figure(TimePlotData(title, _lines(found.t, names, values)))
