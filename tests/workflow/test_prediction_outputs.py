@@ -145,7 +145,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
     many = {f"run {i}": {"s0": offset(0.1)} for i in range(6)}
-    assert torque_offset_table_rows({"torque_offsets": many})[-1][0].startswith("2 more recordings ")
+    assert torque_offset_table_rows({"torque_offsets": many})[-1][0].endswith("2 more recordings")
     assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1
 
 
