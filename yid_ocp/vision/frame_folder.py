@@ -198,7 +198,8 @@ def _vertices(
                 whole = files.check_input_file(path, _MAX_FRAME_BYTES).read_bytes()
                 at = whole.count(b"\n") - body.count(b"\n") + 1
                 text, held = b" ".join(row)[:60].decode("latin-1"), ", ".join(names)
-                raise _damaged(path, f"line {at + i} (point {i + 1}) is '{text}', but needs numbers for {held}") from error
+                what = f"line {at + i} (point {i + 1}) is '{text}', but needs numbers for {held}"
+                raise _damaged(path, what) from error
     if len(values) < count:
         raise _damaged(path, f"it has only {len(values)} of the {count} points that its header states")
     return values[:, :3], values[:, 3:].astype(np.uint8) if len(wanted) > 3 else None
