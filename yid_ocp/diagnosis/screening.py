@@ -233,7 +233,8 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
     p_value = null_test.chi2_p_value(statistic, len(step))
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
-    values, changes = _values(effect, step) | signature.shape_values, (signature.base_changes @ step).tolist()
+    values = _values(effect, step) | signature.shape_values
+    changes = (signature.base_changes @ step).tolist()
     return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, tuple(changes))
 
 

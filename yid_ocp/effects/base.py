@@ -259,7 +259,8 @@ def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
 
 def _arm_tip_frames(system: System) -> tuple[str, ...]:
     """Names of one frame at the end of every arm without a grasp, preferably that of a gripper or hand."""
-    tree, tips = system.mechanism, []
+    tree = system.mechanism
+    tips = []
     for name, joints in joint_names_by_arm(system).items():
         if name in grasp_names(system):
             continue
@@ -305,7 +306,8 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     """
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
-    parents, found = {joint.parent_index for joint in tree.joints}, []
+    parents = {joint.parent_index for joint in tree.joints}
+    found = []
     for name in arm_joint_names(system):
         index = tree.joint_index(name)
         joint = tree.joints[index]

@@ -44,7 +44,8 @@ def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
     """Create the nominal trajectory of a recording from its prediction at the parameters `theta`."""
-    own, rest = predictor.theta_with_episode_values(episode, theta), result.equilibrium
+    own = predictor.theta_with_episode_values(episode, theta)
+    rest = result.equilibrium
     sizes = predictor.integrator_step.sizes
     by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
     if rest is not None:

@@ -137,7 +137,8 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
     measured = {joint for samples in course.episode.measurements for joint in samples.sensor.effort_joints}
     silent = {joint_names[i] for i in course.system.prescribed_coordinate_indices} - measured
     names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
-    forced, load = np.array([joint_names.index(name) for name in names], int), _loads(course)
+    forced = np.array([joint_names.index(name) for name in names], int)
+    load = _loads(course)
     of_place: dict[str, list[float]] = {}
     for name, index in zip(names, forced, strict=True):
         of_place.setdefault(place[name], []).append(load[index])
@@ -156,7 +157,8 @@ def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str
 def _loads(course: _LinearizedEpisode) -> Array:
     """Root mean square load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
-    load, q = np.zeros(system.n_coordinates), rollout.state[:, : system.n_coordinates]
+    load = np.zeros(system.n_coordinates)
+    q = rollout.state[:, : system.n_coordinates]
     springs = [(system.mechanism.joint_index(s.joint_name), s) for s in system.elastic_joints]
     if springs:
         symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest_angle) for _, s in springs))
@@ -320,7 +322,8 @@ def _recording(course: _LinearizedEpisode, factor: Array, observed: Array, short
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"
     ns, driving = len(moving), unknowns.driving
-    at_rest, start_std = np.zeros((ns, len(unknowns.names))), np.zeros(ns) if rests else _loose_start(course)[moving]
+    at_rest = np.zeros((ns, len(unknowns.names)))
+    start_std = np.zeros(ns) if rests else _loose_start(course)[moving]
     intervals = []
     for j in range(len(edges) - 1):
         span_of_steps = slice(int(edges[j]), min(int(edges[j + 1]) + beyond, steps))

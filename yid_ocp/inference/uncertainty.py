@@ -231,7 +231,8 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
-    sums, adjusted = np.array([slopes.T @ errors for slopes, errors in clusters]), []
+    sums = np.array([slopes.T @ errors for slopes, errors in clusters])
+    adjusted = []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
         # directions that no other cluster informs cannot be corrected

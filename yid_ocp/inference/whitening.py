@@ -400,7 +400,8 @@ def torque_biases_and_stds_per_recording(problem: EstimationProblem, x: ArrayLik
     """
     x, found = np.asarray(x, float), list[tuple[Array, Array] | None]()
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
-        whitening, parts = _own_filter(own), problem.unpack_episode_unknowns(x, i)
+        whitening = _own_filter(own)
+        parts = problem.unpack_episode_unknowns(x, i)
         result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)

@@ -425,7 +425,8 @@ class _MultiStartSearch:
 
     def _status_and_message(self) -> tuple[Status, str]:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
-        status, many = result.status, len(self._fits) > 1 and result.status == Status.CONVERGED
+        status = result.status
+        many = len(self._fits) > 1 and result.status == Status.CONVERGED
         message = result.message + f" (best of {len(self._fits)} starts)" * many
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
             message += ". Weights and ± ignore noise of the torques or angles that move the model. Use gauss_newton"
