@@ -303,8 +303,7 @@ def _by_lateness(
     """Return the derivative (M, k) of whitened prediction minus measurement by the lateness [s] of the time stamps."""
     theta, state = problem.theta_of_episode(x, i), result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
-    steps = np.ones(samples.value.shape[1])
-    read = problem.predictor.readings_and_sensitivities
+    steps, read = np.ones(samples.value.shape[1]), problem.predictor.readings_and_sensitivities
     moved = (samples.shifted_earlier_by_delays(s * steps) for s in (-1.0, 1.0))
     ahead, behind = (read(own, state, none, theta)[0] for own in moved)
     return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))

@@ -494,8 +494,7 @@ def _fitted(data: _Data) -> _EffortFit:
     moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
     direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
     cost = float(np.sum((rows @ found - target) ** 2) + np.sum(((found - neutral) / prior) ** 2))
-    own = slice(width, 2 * width)
-    left = np.sqrt(np.mean(remains**2, axis=0))
+    own, left = slice(width, 2 * width), np.sqrt(np.mean(remains**2, axis=0))
     return _EffortFit(found[:width], std[:width], found[own], std[own], left, direct, shift, cost)
 
 

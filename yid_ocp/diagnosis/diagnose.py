@@ -132,12 +132,14 @@ def _examined(
     search.record_stage_end_time("events")
     states = [prediction.rollout.state for prediction in nominal.evaluation.episode_predictions]
     effects = search.problem.candidates_with_prior_ranges_from_states(states)
-    test, held_out_test, spread = null_tests_of_fit(*nominal.at_estimates, limits.significance_level)
+    predicted = nominal.problem.predict_held_out(nominal.unknowns, True)
+    test, held_out_test, spread = null_tests_of_fit(*nominal.at_estimates, limits.significance_level, predicted)
     # the whitening of all hypotheses is fixed here
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
-    nominal = replace(nominal, held_out_loss=held_out_loss(*nominal.at_estimates, spread))
+    nominal = replace(nominal, held_out_loss=held_out_loss(*nominal.at_estimates, spread, predicted))
+    del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5

@@ -151,14 +151,18 @@ def find_events(
     guesses = fit.evaluation.equilibrium_guesses
     pairs, parts = zip(fit.problem.episodes, own.episodes, strict=True), ("torque", "measurements")
     has_same_data = all(getattr(a, part) is getattr(b, part) for a, b in pairs for part in parts)
-    judged = fit.problem if has_same_data else problem_with_whitening_at(own, x, guesses)
-    tested = judged.evaluate(x, False, guesses)
+    judged, tested = fit.problem, fit.evaluation
+    if not has_same_data:
+        judged = problem_with_whitening_at(own, x, guesses)
+        tested = judged.evaluate(x, False, guesses)
     if not tested.ok:
         return NO_EVENTS, None
     series, level = null_test.channels_with_residual_indices(judged), limits.significance_level
     test = null_test.residual_chi2_null_test(series, tested.residual, len(fit.values), level)
     is_flagged = any(window.is_flagged for window in test.windows)
-    evaluation = own.evaluate(x, is_flagged, guesses)
+    evaluation = tested
+    if (is_flagged and not has_same_data) or own.has_process_noise:
+        evaluation = own.evaluate(x, is_flagged, guesses)
     if not evaluation.ok:
         return NO_EVENTS, None
     least = limits.min_log_bayes_factor

@@ -267,8 +267,6 @@ class RefitContext:
         return found
 
 
-HeldOutPredictions = Sequence[EpisodeAndPredictionOrFailure]
-"""Predictions of all held-out recordings, with derivatives if they are asked for."""
 EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
 """Effects to refit, and their values at the start."""
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
@@ -448,16 +446,20 @@ def refit_with_each_effect(
 
 @np.errstate(invalid="ignore")  # of recordings that cannot be predicted
 def held_out_loss(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, spread: Array | None = None
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    spread: Array | None = None,
+    predicted: Sequence[EpisodeAndPredictionOrFailure] = (),
 ) -> HeldOutLoss:
     """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
 
-    `spread` (n, k) is from `AllCandidatesProblem`.
+    `spread` (n, k) is from `AllCandidatesProblem`. `predicted` are predictions with derivatives, if they are known.
     """
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
     factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
-    found, residuals, errors, numbered, count = problem.predict_held_out(x, True), [], [], [], 0
+    found, residuals, errors, numbered, count = predicted or problem.predict_held_out(x, True), [], [], [], 0
     for (episode, result), whitener in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:
@@ -490,7 +492,7 @@ def held_out_loss(
     return HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
 
 
-def held_out_rmse_and_unit_by_channel(found: HeldOutPredictions) -> dict[str, tuple[float, str]]:
+def held_out_rmse_and_unit_by_channel(found: Sequence[EpisodeAndPredictionOrFailure]) -> dict[str, tuple[float, str]]:
     """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_count_dicts_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])

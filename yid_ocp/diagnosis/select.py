@@ -354,7 +354,7 @@ def _equivalents_and_shares(
 def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:
     """Root mean square change of each effect parameter of a fit by one plausible effect more; empty if none can act.
 
-    Any further effect may have a part in the gap that the fit leaves. If it leaves only noise, there is none.
+    Any further effect may have a part in the gap that the fit leaves. A fit that leaves only noise has no gap.
     """
     if _leaves_noise(fit, limits):
         return {}

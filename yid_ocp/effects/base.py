@@ -259,8 +259,7 @@ def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
 
 def _arm_tip_frames(system: System) -> tuple[str, ...]:
     """Names of one frame at the end of every arm without a grasp, preferably that of a gripper or hand."""
-    tree = system.mechanism
-    tips = []
+    tree, tips = system.mechanism, []
     for name, joints in joint_names_by_arm(system).items():
         if name in grasp_names(system):
             continue
@@ -306,8 +305,7 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     """
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
-    parents = {joint.parent_index for joint in tree.joints}
-    found = []
+    parents, found = {joint.parent_index for joint in tree.joints}, []
     for name in arm_joint_names(system):
         index = tree.joint_index(name)
         joint = tree.joints[index]

@@ -119,8 +119,7 @@ def residual_chi2_null_test(
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
     effective = max(degrees - parameters, 1.0)
     ratio = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series)) / max(count - parameters, 1)
-    p_value = chi2_p_value(ratio * effective, effective)
-    channels = {}
+    p_value, channels = chi2_p_value(ratio * effective, effective), {}
     for channel in dict.fromkeys(s.channel for s in series):
         parts = [residual[s.residual_indices] for s in series if s.channel == channel]
         channels[channel] = float(np.mean(np.concatenate(parts) ** 2))

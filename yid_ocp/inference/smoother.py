@@ -217,7 +217,7 @@ class _State:
         return [self.larger[source] for source in sources]
 
 
-def _filtered(variance: _Variances, model: ResidualStateSpaceModel) -> _Filtered:
+def _filtered(variance: Mapping[SmoothedUnknownGroup, float], model: ResidualStateSpaceModel) -> _Filtered:
     return _forwards(model, model.prior_variances_of_unknowns(variance))
 
 
@@ -410,7 +410,7 @@ def force_log_likelihood_coefficients(
     `unknowns` are indices. f is in units of the unknown's reference, `variance` of the groups in its square. Free
     parameters, states and other unknowns are integrated out. The list is empty if the filter is ill-conditioned.
     """
-    done = _forwards(model, model.prior_variances_of_unknowns(variance))
+    done = _filtered(variance, model)
     if not done.updates:
         return []
     free, found, u = done.products[1:, 1:] + np.eye(len(done.products) - 1) / 9.0, [], len(unknowns)

@@ -157,8 +157,7 @@ def sensor_bias_location_name(system: System, sensor: Sensor, frame: str) -> str
 def _loads(course: _LinearizedEpisode) -> Array:
     """Root mean square load of every coordinate, from its spring, motor or prescribed effort, (n,) [N m or N]."""
     system, rollout = course.system, course.nominal.rollout
-    load = np.zeros(system.n_coordinates)
-    q = rollout.state[:, : system.n_coordinates]
+    load, q = np.zeros(system.n_coordinates), rollout.state[:, : system.n_coordinates]
     springs = [(system.mechanism.joint_index(s.joint_name), s) for s in system.elastic_joints]
     if springs:
         symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest_angle) for _, s in springs))

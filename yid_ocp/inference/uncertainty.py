@@ -118,7 +118,11 @@ def assess_goodness_of_fit(
 
 
 def null_tests_of_fit(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, level: float
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    level: float,
+    predicted: Sequence[EpisodeAndPredictionOrFailure] = (),
 ) -> tuple[null_test.NullTestResult, null_test.NullTestResult, Array]:
     """Test whether the residuals of a fit at `x` are only noise: of the estimation and of the held-out recordings.
 
@@ -127,7 +131,7 @@ def null_tests_of_fit(
     `SolverError` if a held-out recording cannot be predicted.
     """
     shared, filters = len(problem.shared_parameters), problem.held_out_whitening_filters
-    predicted = problem.predict_held_out(x, True)
+    predicted = predicted or problem.predict_held_out(x, True)
     own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
 
     def residual_of(moved: EstimationProblem) -> Array | None:
@@ -231,8 +235,7 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
-    sums = np.array([slopes.T @ errors for slopes, errors in clusters])
-    adjusted = []
+    sums, adjusted = np.array([slopes.T @ errors for slopes, errors in clusters]), []
     for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
         share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
         # directions that no other cluster informs cannot be corrected

@@ -146,8 +146,7 @@ class EquilibriumSolver:
         message = self._explain(state, theta, error) if failed else "at rest"
         by_itself = bool(system.servos) and torque is not None
         if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > _MAX_HOLD_DEFLECTION:
-            joint = int(np.argmax(np.abs(give)))
-            failed = True
+            joint, failed = int(np.argmax(np.abs(give))), True
             # with a torque, any of the three starts may lead to a wrong equilibrium
             cause = "the grasp" if torque is None else "the measured torques and the grasp"
             limit = f"at most {_MAX_HOLD_DEFLECTION:g} rad is tolerated"

@@ -336,8 +336,7 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
 def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
     """Names of joints that follow others (`mimic`). They are added to `locked`, because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
-    following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
-    still = list[str]()
+    following, still = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}, list[str]()
     for name, mimic in following.items():
         if wanted is not None and name in wanted:
             what = f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own"

@@ -37,7 +37,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     The page works offline: it contains Plotly's script, unless `write_shared_plotly_script` has written one to the
     page's folder or up to two levels above. Without the extra `report`, a warning is logged and no page is written.
     """
-    if util.find_spec("plotly") is None:
+    if not _installed():
         log.warning("no report is written, because plotly is missing: pip install '.[report]' in the project's clone")
         return False
     import jinja2
@@ -62,10 +62,14 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 def write_shared_plotly_script(folder: Path) -> None:
     """Write Plotly's script to a folder, for pages in it and up to two levels below. Raises `OutputError`."""
-    if util.find_spec("plotly") is not None:
+    if _installed():
         name, text = _plotly_script()
         if not _is_plotly_script(folder / name):
             write_text(folder / name, text)
+
+
+def _installed() -> bool:
+    return util.find_spec("plotly") is not None
 
 
 @functools.cache

@@ -195,8 +195,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     return ended(base.Status.CONVERGED, f"the largest jump at a node (defect) is {now.defect:.1e}")
                 # steps along uninformed directions would only increase the defects
                 step = np.zeros_like(step)
-            slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
-            factor = 1.0
+            slope, factor = float(now.residual @ (now.by_defect + now.jacobian @ step)), 1.0
             while factor >= _MIN_STEP_FRACTION:
                 trial_x = np.clip(x + factor * step, *problem.bounds)
                 trial_nodes = intervals.moved(nodes, now, step, factor)

@@ -70,8 +70,7 @@ class LocalVariableFunction:
         direction = ca.SX.sym("direction", v.numel())
         product = ca.cse([ca.densify(ca.jtimes(gradient, v, direction))])
         times = self._compiled(ca.Function(f"{self.name}_product", [*self._inputs, weight, direction], product))
-        group = pattern.uni_coloring()
-        colour = np.zeros(v.numel(), int)
+        group, colour = pattern.uni_coloring(), np.zeros(v.numel(), int)
         members, column = group.get_triplet()
         colour[members] = column
         row, at = (np.array(x) for x in pattern.get_triplet())

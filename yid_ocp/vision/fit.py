@@ -157,8 +157,7 @@ class ShapeFitter:
             what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
             hint = "pass a cloud with points; if filters removed them, loosen track.options.filters"
             raise DataError(what, where="cloud", allowed="points and skeleton_nodes of shape (n, 3), n >= 1", hint=hint)
-        free = list(self.free_joints)
-        q = self.rest_configuration.copy()
+        free, q = list(self.free_joints), self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
         begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]

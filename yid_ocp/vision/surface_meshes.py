@@ -452,8 +452,7 @@ class DepthCameraModel:
         if self.noise_correlation_length > 0:
             white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
             white /= white.std()
-        chance = rng.random((4, *shape))
-        far = np.where(np.isfinite(depth), depth, 1e3)
+        chance, far = rng.random((4, *shape)), np.where(np.isfinite(depth), depth, 1e3)
         front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
         edge = back - front > self.min_relative_edge_depth * front
         mixed = edge & (chance[0] < self.edge_mixing_probability) & (back < self.max_depth)

@@ -155,8 +155,7 @@ def _grown(branches: Sequence[tuple[str, _SegmentGeometry]]) -> dict[str, _Segme
 def _branch(text: str, links: int) -> tuple[str, _SegmentGeometry]:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
-    count = len(numbers.split(","))
-    hint = "write for example --branch left=0.4,0.03,0.008"
+    count, hint = len(numbers.split(",")), "write for example --branch left=0.4,0.03,0.008"
     if not (name and equals) or (at and not parent) or count not in (3, 6):
         raise ConfigError(f"'{text}' does not describe a branch", where="--branch", allowed=_BRANCH_SHAPE, hint=hint)
     values = base.parse_comma_separated_numbers(numbers, count, "--branch")
