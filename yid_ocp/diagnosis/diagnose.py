@@ -178,7 +178,7 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     seen.search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
     # the recordings are whole again, with their own data
     anew = replace(seen, truncated=(), is_corrected_for_links=False, removed=seen.removed + fall)
-    return _restarted(anew, seen.with_events.with_time_step(h), seen.nominal.values, seen.search.store)
+    return _restarted(anew, seen.with_events.with_half_time_step(), seen.nominal.values, seen.search.store)
 
 
 def _restarted(
@@ -262,7 +262,7 @@ def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: Ev
 
 def _at_finer_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> EstimationProblem:
     """The problem of a fit at half the time step, without events and without held-out recordings."""
-    composed = search.problem.with_time_step(fit.problem.step.time_step / 2, with_held_out=False)
+    composed = replace(search.problem, problem=search.problem.estimated_at_half_time_step)
     return problem_corrected_for_events(composed.problem_with_nominal_and_effects_free(fit.effects), events)
 
 

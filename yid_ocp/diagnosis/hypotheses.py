@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -210,13 +210,19 @@ class AllCandidatesProblem:
         made = problem_with_reestimated_held_out_torque_biases(problem_relinearized_at_torque_bias(made, x, x), x, x)
         return replace(self, problem=_with_filters_of_part(self.problem, made))
 
-    def with_time_step(self, time_step: float, with_held_out: bool = True) -> AllCandidatesProblem:
-        """Return the problem with another time step [s] and untruncated recordings, whitened by sensor noise alone."""
-        made = self.problem.with_time_step(time_step)
-        if self.is_split_in_blocks or not with_held_out:
-            return replace(self, problem=_in_blocks(made) if self.is_split_in_blocks else made, held_out_spread=None)
-        held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(time_step)
-        return replace(self, problem=made.with_episodes(made.episodes, held.episodes), held_out_spread=None)
+    @cached_property
+    def estimated_at_half_time_step(self) -> EstimationProblem:
+        """The problem with half the time step, without held-out recordings, whitened by sensor noise alone."""
+        made = self.problem.with_time_step(self.problem.step.time_step / 2)
+        return _in_blocks(made) if self.is_split_in_blocks else made
+
+    def with_half_time_step(self) -> AllCandidatesProblem:
+        """Return the problem with half the time step and untruncated recordings, whitened by sensor noise alone."""
+        made = self.estimated_at_half_time_step
+        if not self.is_split_in_blocks:
+            held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(made.step.time_step)
+            made = made.with_episodes(made.episodes, held.episodes)
+        return replace(self, problem=made, held_out_spread=None)
 
     def with_smoothed_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:
         """Return the problem with the smoothed errors of torques and angles of a fit to the same recordings."""

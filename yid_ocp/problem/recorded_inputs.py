@@ -152,11 +152,14 @@ def _courses(
             allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
             hint = "import commands (bag: --command-topic TOPIC), or let measured angles move the arm: mode: prescribed"
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
-        rows = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)].T
-        held = [servos[name].command_interpolation == "held" for name in driven]
+        commands = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)]
+        times, rows = _with_lost_samples(t, commands)
+        held, ends = [servos[name].command_interpolation == "held" for name in driven], np.append(times, edges[-1])
         return [
-            _held(row, edges) if jumps else scipy.interpolate.PPoly(np.stack([np.diff(row) / np.diff(t), row[:-1]]), t)
-            for row, jumps in zip(rows, held, strict=True)
+            _held(row, ends)
+            if jumps
+            else scipy.interpolate.PPoly(np.stack([np.diff(row) / np.diff(times), row[:-1]]), times)
+            for row, jumps in zip(rows.T, held, strict=True)
         ]
     if joints.effort is None:
         what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"

@@ -29,6 +29,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
+from yid_ocp.model.system import System
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmImperfections
@@ -43,6 +44,7 @@ _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments 
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 """Standard deviations [N m] of the torques' white noise and constant offsets, in experiments with torque noise."""
 _PRESCRIBED_SIGN_SMOOTHING_SPEED = 0.005  # of nominal friction, for joints that stand still under a load [rad/s]
+_SERVO_SIGN_SMOOTHING_SPEED = 0.001  # likewise, of joints with servos, whose encoders show the creep of slower ones
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
@@ -334,15 +336,16 @@ class _ExperimentVariation:
         own = (mass, *bare) if self.is_without_object else (mass,)
         return own if arm.friction_law == "none" else (*own, "model.friction=null")
 
-    def diagnosis_overrides(self, driven: Sequence[str], arm: VirtualArmImperfections) -> list[str]:
+    def diagnosis_overrides(self, simulated: System, arm: VirtualArmImperfections) -> list[str]:
         own = [text for text in self.simulation_overrides(arm) if text != "model.friction=null"]
         if arm.friction_law != "none":
             law = self.friction if arm.friction_law == "varied" else arm.friction_law
-            speed = _PRESCRIBED_SIGN_SMOOTHING_SPEED if self.has_prescribed_arms else "null"
+            speed = _SERVO_SIGN_SMOOTHING_SPEED if simulated.servos else "null"
+            speed = _PRESCRIBED_SIGN_SMOOTHING_SPEED if self.has_prescribed_arms else speed
             own.append(f"model.friction={{law: {law}, sign_smoothing_speed: {speed}}}")
             own += ['parameters={"*.v_stribeck": {free: false}}'] if "stribeck" in law else []
         if self.is_without_object:
-            free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}
+            free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in simulated.driven}
             own += [f"parameters={json.dumps(free)}", "diagnosis.candidates=all"]
         return own + (["model.arms.mode=prescribed"] if self.has_prescribed_arms else [])
 
@@ -428,7 +431,7 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
     begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]", "diagnosis.budget=null")
-    overrides = varied.diagnosis_overrides(simulated.driven, simulated_run.virtual_arm)
+    overrides = varied.diagnosis_overrides(simulated, simulated_run.virtual_arm)
     run = load_config(experiment.config_file, (*overrides, *begun))
     ensemble = blind.BlindCaseGenerator(
         build_problem(run),
@@ -450,9 +453,9 @@ def _require_compatible(run: RunSettings) -> None:
         allowed, hint = "settings without these keys", "remove these keys, for example in a copy of the file"
         raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
     system = build_system(run)
-    if not system.driven or system.prescribed or system.servos:
-        what, hint = "a blind test needs arms whose joints are all driven by torques", "set model.arms.mode: driven"
-        raise run.config_error(what, "model", "arms", "mode", allowed="driven, without servos", hint=hint)
+    if not system.driven or system.prescribed:
+        what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
+        raise run.config_error(what, "model", "arms", "mode", allowed="driven, servo", hint=hint)
 
 
 def _blind_experiments_and_refinable_subset(
@@ -472,6 +475,8 @@ def _blind_experiments_and_refinable_subset(
             except YidError as error:
                 log.info("%s.%s is left out: %s", name, variation, error.what)
                 continue
+            if system.servos and varied.has_torque_noise:
+                continue  # servos record no torques
             found[f"{name}.{variation}"] = experiment
             if system.segment_layouts:
                 chains.add(f"{name}.{variation}")
