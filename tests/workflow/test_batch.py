@@ -184,7 +184,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
 
 def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, printed, monkeypatch):
     prescribed = load_config(pendulum)
-    with pytest.raises(ConfigError, match=r"all driven by torques(.|\n)*model.arms.mode"):
+    with pytest.raises(ConfigError, match=r"joints are all driven(.|\n)*model.arms.mode"):
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="two configurations have the name pendulum"):
         run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=InlineExecutor())

@@ -66,10 +66,11 @@ def step_mean_inputs(
     """Return the mean input (steps, nu) of driven joints in every step: torque [N m] or servo command [rad or m].
 
     Effort samples are interpolated by a cubic spline. Efforts that are interval means are integrated, and the input is
-    the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` are piecewise
-    constant, with up to five lost samples in a row interpolated. Each input acts later than recorded by `delay` (nu,)
-    [s]. With `servos` (of all driven joints) the input is the position command, or `MOTOR_OFF_COMMAND`. `where` is the
-    name of the recording. Raises `DataError` if a joint is missing or efforts (`servos`: commands) are not recorded.
+    the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` and held
+    commands of servos are piecewise constant, with up to five lost samples in a row interpolated. Each input acts later
+    than recorded by `delay` (nu,) [s]. With `servos` (of all driven joints) the input is the position command, or
+    `MOTOR_OFF_COMMAND`. `where` is the name of the recording. Raises `DataError` if a joint is missing or efforts
+    (`servos`: commands) are not recorded.
     """
     if not driven:
         return np.zeros((grid.steps, 0))
@@ -154,13 +155,13 @@ def _courses(
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
         commands = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)]
         times, rows = _with_lost_samples(t, commands)
-        held, ends = [servos[name].command_interpolation == "held" for name in driven], np.append(times, edges[-1])
-        return [
-            _held(row, ends)
-            if jumps
-            else scipy.interpolate.PPoly(np.stack([np.diff(row) / np.diff(times), row[:-1]]), times)
-            for row, jumps in zip(rows.T, held, strict=True)
-        ]
+
+        def command(row: Array, name: str) -> scipy.interpolate.PPoly:
+            if servos[name].command_interpolation == "held":
+                return _held(row, np.append(times, edges[-1]))
+            return scipy.interpolate.PPoly(np.stack([np.diff(row) / np.diff(times), row[:-1]]), times)
+
+        return list(map(command, rows.T, driven))
     if joints.effort is None:
         what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"
         hint = "import a file with efforts, or set model.arms.mode: prescribed"
