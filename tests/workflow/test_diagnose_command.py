@@ -323,6 +323,7 @@ def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole
     """The numbers of a diagnosis and of the chosen friction law, where the model has neither effect nor law."""
     both = ", ".join(str(rubbing.with_name(f"{name}.h5")) for name in ("estimate", "held_out"))
     settings = ["recordings.held_out=[]", f"recordings.estimate=[{both}]", "output.write_report=true"]
+    settings.append("model.friction={law: viscous, sign_smoothing_speed: 0.003}")
     done = cli("friction", rubbing, "--out", tmp_path / "law", settings=settings)
     law, diagnosis = json.loads((tmp_path / "law" / "result.json").read_text()), whole[0].result
     for result in (law, diagnosis):
@@ -336,6 +337,7 @@ def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole
         known = build_system(load_config(tmp_path / "merged.yaml")).parameters
         for name, value in (line.split(" = ") for line in use["values"]):
             assert known[name].value == pytest.approx(float(value.split()[0]), rel=1e-3)
+    assert "sign_smoothing_speed: 0.003" in law["to_use"]["yaml"][1]
     fit = law["laws"][law["warranted"]]["parameters"]
     assert law["friction_parameters"] == [name for name in fit if name != "shoulder.stiffness"]
     first_screen = (tmp_path / "law" / "report.html").read_text("utf-8").partition('id="scene"')[0]

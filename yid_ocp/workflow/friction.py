@@ -29,13 +29,13 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
     Successful if the warranted law's fit to all recordings converged. Raises `DataError` if no law can be tested.
     """
-    joints = None if run.model.friction is None else run.model.friction.joints
+    said = run.model.friction or FrictionLawSettings(law="viscous")
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
         fits: list[CrossValidatedFrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
         by_law = {
-            law: replace(run, model=replace(run.model, friction=FrictionLawSettings(law=law, joints=joints)))
+            law: replace(run, model=replace(run.model, friction=replace(said, law=law)))
             for law in EFFECT_KINDS_BY_FRICTION_LAW
         }
         settings, *others = by_law.values()
@@ -74,7 +74,8 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             "warranted": best.law,
             "friction_parameters": [name for name in names if name in problem.free],
         }
-        section = f"{{law: {best.law}, joints: [{', '.join(result['joints'])}]}}"
+        speed = "" if said.sign_smoothing_speed is None else f", sign_smoothing_speed: {said.sign_smoothing_speed:g}"
+        section = f"{{law: {best.law}, joints: [{', '.join(result['joints'])}]{speed}}}"
         again = "solve", os.path.relpath(folder.final_path / "config.yaml"), "--set", f"model.friction={section}"
         model = ["model:", f"  friction: {section}"]
         copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters, again
