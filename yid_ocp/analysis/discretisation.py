@@ -131,13 +131,14 @@ def _gauss_newton_step_in_finer_model(
 
 
 def predicted_refit_residual_at_finer_step(
-    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation
+    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation, is_refitted: bool = False
 ) -> Array | None:
     """Predict the whitened residual that a fit with a shorter time step would have, or return None if this fails.
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
-    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without it,
-    `fine` is fitted if the shorter step changes predictions by more than the residual, too much for one linear step.
+    `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without it, `fine`
+    is fitted with `is_refitted`, or if the shorter step changes predictions by more than the residual, too much for one
+    linear step.
     """
     refined = _FinerModel(fine)
     made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
@@ -146,7 +147,7 @@ def predicted_refit_residual_at_finer_step(
     _, left, before = made
     is_alike = len(before.residual) == len(at_x.residual)
     changed = before.residual - at_x.residual if is_alike else np.zeros(1)
-    if changed @ changed <= at_x.residual @ at_x.residual:
+    if not is_refitted and changed @ changed <= at_x.residual @ at_x.residual:
         return left
     start = refined._unknowns(coarse.unknown_names, x)
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)

@@ -159,18 +159,19 @@ def _examined(
     return _at_finer_discretisation(seen, nominal, screened.largest_predicted_chi2_decrease)
 
 
-def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float) -> _Examined:
+def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is_refitted: bool = False) -> _Examined:
     """The nominal model, examined again at half the time step or without the error of the links.
 
     `seen` if neither lowers r'r of a fit significantly and by half of a candidate's fall (`gap`), or after the links.
+    With `is_refitted`, only half the time step is tried, by a refit: a fit with long steps may lie in a wrong minimum.
     """
     if seen.is_corrected_for_links:
         return seen
-    fall = _fall_at_half_time_step(seen.search, fit, seen.events)
+    fall = _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
     if fall > least:
         return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
-    return _without_error_of_links(seen, fit, least)
+    return seen if is_refitted else _without_error_of_links(seen, fit, least)
 
 
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
@@ -194,7 +195,8 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
     """The nominal model, examined again if noise or discretisation need it beside the effects; else `seen`."""
     fits = [entry.refitted_model for entry in judged.selected_effects]
     if not fits:
-        return seen
+        gap = seen.evidence.screening.largest_predicted_chi2_decrease
+        return _at_finer_discretisation(seen, seen.nominal, gap, True) if judged.verdict == "unknown" else seen
     if judged.verdict == "unknown":
         problem = seen.with_events.with_encoder_noise_in_efforts(fits[-1].effects, fits[-1].values)
         if problem is not None:
@@ -246,11 +248,11 @@ def _with_changed_parameters(
     return seen, judged
 
 
-def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> float:
+def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet, is_refitted: bool) -> float:
     """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
     fine = _at_finer_step(search, fit, events)
-    left = discretisation.predicted_refit_residual_at_finer_step(fine, *fit.at_estimates)
+    left = discretisation.predicted_refit_residual_at_finer_step(fine, *fit.at_estimates, is_refitted)
     if left is None:
         return -math.inf
     # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step

@@ -58,8 +58,9 @@ class CompiledInverseDynamics:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Return the magnitudes at increasing nodes (M,). Velocities and accelerations are finite differences."""
+        """Return the magnitudes at nodes (M,), also repeated ones. Speeds and accelerations are finite differences."""
         system, time_step = self._step.system, self._step.time_step
+        nodes, repeated = np.unique(nodes, return_inverse=True)
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
         v = np.gradient(q, time_step, axis=0)
@@ -73,7 +74,8 @@ class CompiledInverseDynamics:
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
         rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
-        return _TorqueTermSizes(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
+        sizes = np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held)
+        return _TorqueTermSizes(*(size[repeated] for size in sizes))
 
 
 def _function(system: System, time_step: float) -> ca.Function:
