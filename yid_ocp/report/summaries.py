@@ -332,8 +332,9 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    own = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
-    yield next_steps_table(result, own if result["status"] == "done" and result["from"]["run"] is None else {})
+    steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
+    longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
+    yield next_steps_table(result, longer if not is_usable and said != done else {} if result["from"]["run"] else steps)
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -352,7 +353,8 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
         known = f"(one standard deviation; position_tolerance: {asked:g} mm)"
-        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}."
+        miss = " So the real object may miss the place." * (1e3 * max(result["std"]) > asked)
+        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}.{miss}"
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
@@ -564,9 +566,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
-    good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
-    used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
-    yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
+    used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
+    used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
         of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}

@@ -216,7 +216,7 @@ def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
     every = (pair for entry in result.get("torque_offsets", {}).values() for pair in entry.items())
     large = dict.fromkeys(joint for joint, own in every if abs(own["value"]) > 2 * own["prior_std"])
     do = "The estimates take this into account. Check the calibration of the torque sensor."
-    return f"Over twice the expected size is the torque offset of {', '.join(large)}. {do}" if large else ""
+    return f"The torque offset of {', '.join(large)} is over twice the expected size. {do}" if large else ""
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:

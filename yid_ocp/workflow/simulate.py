@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,7 +55,7 @@ def run_simulate(
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             result |= {"status": "done", "message": "", "duration": recording.duration}
-            result["file"] = os.path.relpath(folder.final_path / "recording.h5")
+            result["file"] = str(folder.final_path / "recording.h5")
             result |= {"groups": groups, "truth": dict(recording.true_parameters)}
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
