@@ -33,7 +33,7 @@ from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_strict_json
-from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, VERDICT_SENTENCE_TEXTS, interval_text
+from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, VERDICT_TABLE_TEXTS, interval_text
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import sha256_of_folder_sources
@@ -187,7 +187,7 @@ def _reason(
         lower = upper = None
     holds = (lower is None or lower <= published) and (upper is None or published <= upper)
     if own["verdict"] == "not_identifiable" or (own["verdict"] != "identifiable" and holds):
-        known = f"in such an experiment it {VERDICT_SENTENCE_TEXTS[own['verdict']]}"
+        known = f"its verdict in such an experiment is '{VERDICT_TABLE_TEXTS[own['verdict']]}'"
         if interval is not None:
             return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
         return f"not informed; {known}"

@@ -154,7 +154,7 @@ def unknown():
         seen = screening([score(own, p=p) for own, p in zip(joints, p_values, strict=True)])
         few = {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}
         yield f"significant at {of}", finding("unknown", unknown_reason="little", screening=seen, **few)
-    hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
+    hurried = {"thresholds": Thresholds(budget=12.5), "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield (
         "stopped with an effect",

@@ -238,7 +238,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png') == 3
     assert f"The blind test has {len(marks)} synthetic cases (seed 1" in page
-    assert ("False alarms: a gap was found in 0 of 5 cases" in page) == bool(marks)
+    assert ("0 of 5 cases without an effect had a false alarm." in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
     with pytest.raises(OutputError, match="cannot be written"):
         draw_blind_validation_figures(tmp_path / "nowhere", result)
@@ -246,6 +246,6 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
 
 def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
     lines = blind_validation_markdown_lines(to_json_types(blind_case_score_summary(MARKS)))
-    assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
+    assert "| no effect: false alarms (a gap is reported) | 0 % (0 of 5, 0 % to 52 %) | 0 % |" in lines
     assert f"| 3 | 8 | {' | '.join([*2 * ['75 % (6 of 8, 35 % to 97 %)'], '50 % (4 of 8, 16 % to 84 %)'])} |" in lines
-    assert "| two | 5 | 0 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines
+    assert "| two | 5 |  | 0 % (0 of 5, 0 % to 52 %) | - |" in lines

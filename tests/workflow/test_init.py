@@ -88,7 +88,7 @@ SHORT = np.arange(0, 2, 1 / RATE)
 
 def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
-    assert "`init` assigns recorded m1 to the frame cable:50% of the model, because it is" in capsys.readouterr().out
+    assert "`init` assigns recorded m1 to the frame cable:50% of the model, because its" in capsys.readouterr().out
     run = load_config("run.yaml")
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
@@ -231,7 +231,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     # the constant error of a torque is never silently zero, and what looks for friction is said without a warning
     assert run.sensors["joints.effort"].bias_std == pytest.approx(0.01 * 50.0)  # of its limit
     text = Path("run.yaml").read_text()
-    assert "set both use: true and bias_std, the" in text
+    assert "To use the efforts, set use: true. bias_std is the" in text
     assert "add {kind: effort_offset, location: JOINT} to\n" in text
     assert "#   efforts are taken as samples, since the recordings do not state it" in text
     Path("friction.yaml").write_text(text.replace("use: false, ", "use: true, ").replace("# friction:", "friction:"))

@@ -56,8 +56,6 @@ class MethodsComparisonResult:
     # result of `solve`: the checked reference or, with process noise, that of a method that models it
     verdict_solution: Solution
     disagreements: Mapping[str, list[str]]  # identifiable parameters that differ, with the reason, as one sentence
-    # sentences on unidentifiable parameters, and on errors of steepest descent relative to a known truth
-    explanations: tuple[str, ...]
 
     @property
     def is_consistent(self) -> bool:
@@ -68,7 +66,6 @@ class MethodsComparisonResult:
 def compare_methods(
     problem: EstimationProblem,
     solvers: Sequence[Solver],
-    truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     total_time_budget: float = math.inf,
@@ -78,8 +75,8 @@ def compare_methods(
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
     minimise the problem's cost without process noise, because not every method supports it. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
-    `truth` holds known true values by parameter. `callback` receives the method's name and every `Iterate`. `limits`
-    states when a residual exceeds noise. Each method gets an equal part of the remaining `total_time_budget` [s].
+    `callback` receives the method's name and every `Iterate`. `limits` states when a residual exceeds noise. Each
+    method gets an equal part of the remaining `total_time_budget` [s].
     """
     runs, whole, problem = [], problem, problem_with_exact_inputs(problem)
     deadline = time.perf_counter() + total_time_budget
@@ -117,8 +114,7 @@ def compare_methods(
     else:
         judged = estimation.add_intervals_and_checks(problem, best.solution)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
-    explained = tuple(_explanations(runs, best, judged.parameters, truth or {}, whole.has_process_noise))
-    return MethodsComparisonResult(tuple(runs), best.method, whole.has_process_noise, judged, agreement, explained)
+    return MethodsComparisonResult(tuple(runs), best.method, whole.has_process_noise, judged, agreement)
 
 
 def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
@@ -138,58 +134,6 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
     else:
         why = "its cost weights the measurements differently"
     return [f"gives other values than {best.method}, because {why}: {', '.join(values)}"] if values else []
-
-
-def _explanations(
-    runs: Sequence[_MethodResult],
-    best: _MethodResult,
-    judged: Mapping[str, ParameterEstimate],
-    truth: Mapping[str, float],
-    has_process_noise: bool,
-) -> list[str]:
-    runs, sentences, weak, lost = [run for run in runs if run.has_values], [], [], []
-    for name, reference in ((n, e) for n, e in judged.items() if e.free and e.verdict != "identifiable"):
-        known = f"{name} (truth {truth[name]:g} {reference.unit})" if name in truth else name
-        places = ", ".join(f"{run.solution.parameters[name].value:.3g} ({run.method})" for run in runs)
-        use = f"Do not rely on one method's value in {reference.unit}: {places}"
-        if reference.verdict == "not_identifiable":
-            lost.append(known)
-        elif has_process_noise and reference.verdict == "weak":
-            weak.append(known)
-        else:
-            sentences.append(f"{known} {uncertainty.VERDICT_SENTENCE_TEXTS[reference.verdict]}. {use}")
-    sentences += [f"For {', '.join(weak)}, use the 95 % interval of the column `solve`"] if weak else []
-    sentences += [f"{', '.join(lost)} cannot be found, so no value is shown (–)"] if lost else []
-    descents = [run for run in runs if run.method == "steepest_descent" and truth and not has_process_noise]
-    return sentences + [_descent_errors(run, best, judged, truth) for run in descents]
-
-
-def _descent_errors(
-    run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
-) -> str:
-    """Return a sentence on the parameters that a method, and perhaps also `best`, left far from `truth`."""
-
-    def is_far(method: _MethodResult, name: str) -> bool:
-        # the same limit applies to the standard deviation of an identifiable parameter
-        distance = abs(method.solution.parameters[name].value - truth[name])
-        return distance > uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth[name])
-
-    wrong = [name for name, entry in judged.items() if entry.free and name in truth and is_far(run, name)]
-    seen = [name for name in wrong if judged[name].verdict == "identifiable"]
-    limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
-    if not wrong:
-        return f"{run.method} ended within {100 * limit:.0f} % of the truth for all parameters"
-    if not seen:
-        said = f"{run.method} is more than {100 * limit:.0f} % from the truth only for {', '.join(wrong)}"
-        return f"{said}, and no value of these counts as found"
-    own = [(name, run.solution.parameters[name]) for name in seen]
-    places = ", ".join(f"{name} = {entry.value:.3g} {entry.unit} (true {truth[name]:.3g})" for name, entry in own)
-    why = "Its cost weights the measurements differently"
-    if run.solution.status != Status.CONVERGED:
-        why = f"It ended too early ({run.solution.status.value})"
-    elif all(is_far(best, name) for name in seen):
-        why = f"The best fit, that of {best.method}, is also far from the truth"
-    return f"Do not use {run.method} here: it gives {places}, although the recordings determine this. {why}"
 
 
 class _Memory:

@@ -178,6 +178,7 @@ def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     errors = [entry for m in singles for entry in m.errors.values()]
     shares = {
         "false_alarms": [m.gap for m in by["null"]],
+        "detected": [m.gap for m in singles],
         "kind_first": [m.kind_first for m in seen],
         "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],

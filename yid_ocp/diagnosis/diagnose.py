@@ -408,7 +408,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
         is_corrected_for_links=seen.is_corrected_for_links,
         has_time_step_error_in_std=is_counted,
-        search_seconds=ends["refits"] - ends[""],
         law=law,
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))

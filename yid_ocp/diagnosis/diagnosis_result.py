@@ -52,7 +52,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
-    search_seconds: float = 0.0  # from the start to the end of the search for effects
     # [s]; they differ if the stated step's error was part of the gap
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links

@@ -63,8 +63,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
-    stopped = f"The time limit diagnosis.budget ended the search after {result.search_seconds:.0f} s. Not tested: "
-    untried = _listed(stopped, result.untried, ". To test them, raise diagnosis.budget.")
+    stopped = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
+    untried = _listed(stopped, result.untried, ". To test them, raise this limit.")
     text = [" ".join([*_use(result), _gap(result)]), untried]
     if result.verdict not in ("insufficient_data", "no_gap"):
         (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
@@ -143,7 +143,10 @@ def _gap(result: DiagnosisResult) -> str:
         said = f"{dof} independent samples ({few}), and would show {sum(seen)} of {len(seen)} effects"
         return f"The model is not tested: the recordings have {said} (at least 1 is needed)."
     if result.verdict == "no_gap":
-        said = f"Use the model for motions like these. There is no relevant gap: {sizes} ({chance})."
+        said = (
+            f"Use the model for motions like these. There is no relevant gap: {sizes} ({chance}). The recordings would "
+        )
+        said += f"show {sum(seen)} of {len(seen)} effects."
         return "\n".join(filter(None, [said, *_why_no_gap(result)]))
     if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
         seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
@@ -206,16 +209,17 @@ def _causes(result: DiagnosisResult) -> list[str]:
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
     none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
-    more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set."
+    is_narrow = (len(kinds) <= _FEW_KINDS) * (not result.untried)
+    more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set." * is_narrow
     reasons = {
-        "none": f"{none} no effect that was tried explains the error well enough.{more * (len(kinds) <= _FEW_KINDS)}",
+        "none": f"{none} no effect that was tried explains the error well enough.{more}",
         "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
         "stand_in": f"{none} {size}{apart}. {either}.",
     }
     laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
     alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
     alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    reason = reasons.get(result.unknown_reason, "") if result.single_effect_models or not result.untried else ""
+    reason = reasons.get(result.unknown_reason, "") * bool(result.single_effect_models or not result.untried)
     return [*text, reason, alone * bool(laws), _several_places(result)]
 
 

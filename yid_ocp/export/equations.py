@@ -18,12 +18,7 @@ _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step
 
 
 def _exported_step_functions(symbols: NamedStepEquations) -> tuple[ca.Function, ...]:
-    """Return the CasADi functions that `export_step_functions` writes.
-
-    The functions `rows` (del, internal, constraint, p1), its Jacobian `rows_by_theta` and, if not too large, its
-    Jacobian `rows_by_unknowns` (by q1, z1, lam) have the arguments `_ARGUMENT_NAMES`. `points` maps (q, theta) to
-    positions of points [m], `mechanics` (q, v, theta) to mass matrix, dL/dq, dL/dv. Both set internal coordinates to 0.
-    """
+    """Return the CasADi functions of docs/howto/inspection.md. Points and mechanics set internal coordinates to 0."""
     e, system = symbols.equations, symbols.equations.system
     names, blocks = zip(*((block.name, block.expressions) for block in symbols.row_blocks), strict=True)
     by_rows, by_p1, _ = parameter_jacobian_function(e, system.parameters.names)(*e.arguments)

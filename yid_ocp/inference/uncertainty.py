@@ -465,16 +465,15 @@ def mark_free_estimates_not_trusted(known: Mapping[str, ParameterEstimate]) -> d
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
 
-VERDICT_SENTENCE_TEXTS: Mapping[str, str] = {
-    "fixed": "is fixed",
-    "identifiable": "is found",
-    "weak": "is weakly determined",
+VERDICT_TABLE_TEXTS: Mapping[str, str] = {
+    "fixed": "fixed",
+    "identifiable": "found",
+    "weak": "weakly determined",
     "not_identifiable": "cannot be found",
-    "at_bound": "is at its bound",
-    "not_trusted": "is in doubt",
+    "at_bound": "at its bound",
+    "not_trusted": "in doubt",
 }
-"""Sentence predicate for a parameter of each verdict."""
-VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_SENTENCE_TEXTS.items()}
+"""Words for each verdict of a parameter."""
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:

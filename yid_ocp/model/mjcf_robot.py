@@ -191,7 +191,7 @@ def _left_out(model: Any) -> Iterator[str]:
         "motors": (motors, "Efforts count as torques at the joint, and the motors' limits are kept"),
         "actuators other than motors and position servos": (len(others_than_servos) - motors, lacking),
         "equalities": (model.neq - taken, "For a weld or connect that closes a loop, set model.grasp"),
-        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "To have them, set model.joint_springs"),
+        "springs of joints": (int(np.sum(model.jnt_stiffness > 0)), "To add them to efforts, set model.joint_springs"),
         "tendons": (model.ntendon, lacking),
         "bodies of free objects": (len(_bodies_of_free_objects(model)), "Contacts are not modelled"),
         "gravity compensation of bodies": (int(np.sum(np.asarray(model.body_gravcomp) > 0)), lacking),

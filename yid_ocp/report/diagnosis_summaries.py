@@ -14,6 +14,7 @@ from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, locations_by_effect_kind, p_value_text, unseen_effects_sentence
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
+    MAX_NOISE_RATIO,
     CodeBlock,
     SummaryBlockOrTextIterator,
     SummaryStatement,
@@ -21,7 +22,9 @@ from yid_ocp.report.terminal import (
     TableRows,
     copyable_estimates_blocks,
     issue_summary_blocks,
+    large_torque_offsets_sentence,
     misfit_summary_blocks,
+    next_steps_table,
     register_summary,
     scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
@@ -35,6 +38,16 @@ _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a 
 _FOUND_VERDICTS = ("identifiable", "weak", None)
 """Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
+_MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
+_SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
+_BLIND_CATEGORY_TEXTS = {
+    "null": "without an effect",
+    "single": "with one effect",
+    "pair": "with two effects",
+    "outside": "with a cause that the diagnosis does not know",
+    "left_out": "with an effect that was removed from its candidates",
+    "finer_chain": "with more links than the model (no answer counts)",
+}
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -78,7 +91,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
     rows = [("effect", "places"), *((k, ", ".join(own)) for k, own in locations_by_effect_kind(unseen).items())]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
-    lacking = [f"{signals} ({', '.join(kinds)})" for signals, kinds in result.get("not_candidates", {}).items()]
+    missing = result.get("not_candidates", {}).items()
+    lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
     yield f"No recording has these signals, so their effects were not tried: {', '.join(lacking)}." if lacking else ""
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
@@ -93,6 +107,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((channel, made, *sizes, entry["unit"]))
     yield SummaryTable(rows, "Errors on recordings made without and with the effects")
     yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
+    yield large_torque_offsets_sentence(result)
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         known = result["next_plan"].items()
@@ -123,23 +138,40 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 @register_summary("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
-    count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"The first answer is true in {right['count']} of {right['of']} detected gaps."] * bool(right["of"])
-    if alarms["of"]:
-        said.append(f"False alarms: a gap was found in {alarms['count']} of {alarms['of']} cases without an effect.")
+    yield from (SummaryStatement(text, "verdict") for text in _blind_sentences(result))
+    yield replace(score, is_key_table=True)
+    yield from others
+    yield replace(cases, is_page_only=True)
+
+
+def _blind_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on cases, right answers, false alarms, overlooked effects and probabilities of a blind test."""
+    count, kinds = len(result["marks"]), Counter(entry["category"] for entry in result["marks"])
+    parts = ", ".join(f"{kinds[kind]} {words}" for kind, words in _BLIND_CATEGORY_TEXTS.items() if kinds[kind])
+    yield f"The blind test has {count} synthetic cases (seed {result['seed']}): {parts or 'none'}."
+    hours = (result["seconds"] or 0.0) * _MIN_CONCLUSIVE_CASES / 3600
+    text = "Draw no conclusion from so few cases: the 95 % intervals below are wide. Repeat the command with --cases "
+    text += f"{_MIN_CONCLUSIVE_CASES} and another --out (about {hours:.1f} h on one processor)."
+    yield text if 0 < count < _MIN_CONCLUSIVE_CASES else ""
+    right, of = (sum(own["right"][key] for own in result["experiments"].values()) for key in ("count", "of"))
+    alarms, seen, first = (result["intervals"][key] for key in ("false_alarms", "detected", "kind_first"))
+    yield f"{right} of {of} cases with a hidden cause were answered right." if of else ""
+    yield f"{alarms['count']} of {alarms['of']} cases without an effect had a false alarm." if alarms["of"] else ""
+    missed = f"{seen['of'] - seen['count']} of {seen['of']} cases with one effect were overlooked: no gap was reported."
+    yield missed if seen["of"] else ""
+    yield (
+        f"In {first['count']} of the other {first['of']}, the first candidate is the true effect."
+        if first["of"]
+        else ""
+    )
     stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
     if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
         do = "agree with the outcomes" if near >= len(stated) - 1 else "disagree with the outcomes, so do not use them"
-        said.append(f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share.")
-    said.append(f"The blind test has {count} synthetic cases (seed {result['seed']}, purpose '{result['purpose']}').")
-    if result.get("not_judged"):
-        said.append(f"{result['not_judged']} more cases are not judged, because changed thresholds need further fits.")
-    yield from (SummaryStatement(text, "verdict") for text in said)
-    yield replace(score, is_key_table=True)
-    yield "-: there is no such case." if any(row[1] == "-" for row in score.rows) else ""
-    yield from others
-    yield replace(cases, is_page_only=True)
+        yield f"Stated probabilities {do}: {near} of {len(stated)} are in the 95 % interval of the true share."
+    unjudged, why = result.get("not_judged"), "because changed thresholds need further fits"
+    yield f"{unjudged} more cases are not judged, {why}." if unjudged else ""
+    yield "table.md has every case, and marks wrong answers by '(wrong)'." if count else ""
 
 
 def blind_validation_markdown_lines(result: Mapping[str, Any]) -> list[str]:
@@ -153,34 +185,34 @@ def blind_validation_markdown_lines(result: Mapping[str, Any]) -> list[str]:
 def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     """Return the tables of the score, detection by size, experiments, cases and, if calibrated, thresholds."""
     sure = {name: _rate(own) for name, own in result["intervals"].items()}
-    marks: TableRows = [
-        ("what", "value, and its binomial 95 % interval"),
-        ("false alarms on clean data", sure["false_alarms"]),
-        ("true kind and place first, of the detected gaps", sure["kind_first"]),
-        ("true kind and place among the first two", sure["kind_in_two"]),
-        ("true place first", sure["location_first"]),
-        ("the named effects, alone or as not separable, include the true one", sure["sets_cover"]),
-        ("number of named effects, on average", _number(result["set_size"], ".2f")),
-        ("verdict unknown for effects outside the library", sure["unknown_outside"]),
-        ("verdict unknown for effects removed from it", sure["unknown_left_out"]),
-        ("true place first, for these two kinds of effects", sure["unknown_location"]),
-        ("both of a pair, each alone or in a set of three", sure["pairs_right"]),
-        ("both of a pair, each alone", sure["pairs_named"]),
-        ("closure divided by that of the refitted true effects", _share(result["closure_of_best"])),
-        ("median error of the effects' parameters", _share(result["parameter_error"], 1)),
-        ("95 % intervals of parameters that contain the true value", sure["interval_coverage"]),
-        ("expected calibration error", _number(result["calibration"]["expected_calibration_error"], ".3f")),
-        ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
+    error = result["calibration"]["expected_calibration_error"]
+    measures: TableRows = [
+        ("no effect: false alarms (a gap is reported)", sure["false_alarms"], "0 %"),
+        ("one effect: a gap is reported", sure["detected"], "100 %"),
+        ("- then the first candidate is the true effect", sure["kind_first"], "100 %"),
+        ("- then the first reported place is that of the effect", sure["location_first"], "100 %"),
+        ("- then the effect named first is the true one, or cannot be told from it", sure["sets_cover"], "100 %"),
+        ("number of effects in the set that is named first", _number(result["set_size"], ".2f"), "1"),
+        ("a cause that the diagnosis does not know: verdict unknown", sure["unknown_outside"], "100 %"),
+        ("an effect that was removed from its candidates: verdict unknown", sure["unknown_left_out"], "100 %"),
+        ("these two kinds, gap reported: the first reported place is true", sure["unknown_location"], "100 %"),
+        ("two effects: both reported, each alone or in a set of three", sure["pairs_right"], "100 %"),
+        ("removed part of the gap / part that the true effect removes", _share(result["closure_of_best"]), "100 %"),
+        ("median error of the parameters of true effects", _share(result["parameter_error"], 1), "0 %"),
+        ("95 % intervals of these parameters that contain the true value", sure["interval_coverage"], "95 %"),
+        ("mean difference of stated probability and true share", _number(error, ".3f"), "0"),
+        ("time of one diagnosis", _number(result["seconds"], ".0f", " s"), ""),
     ]
-    seen: TableRows = [("size / detectable size", "cases", "gap seen", "kind and place first", "alone or in set of 3")]
+    marks = [("what", "value (cases, 95 % interval)", "good is"), *(row for row in measures if row[1] != "-")]
+    seen: TableRows = [("size / detectable size", "cases", "gap reported", "true effect first", "true effect named")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
-    tried: TableRows = [("experiment", "cases", "not judged", "false alarms", "right")]
+    tried: TableRows = [("experiment", "cases", "not judged", "false alarms", "right answers")]
     for name, own in result["experiments"].items():
-        counts = (str(own["cases"]), str(own.get("not_judged", 0)))
+        counts = (str(own["cases"]), str(own.get("not_judged") or ""))
         tried.append((name, *counts, _rate(own["false_alarms"]), _rate(own["right"])))
-    sure_of: TableRows = [("stated probability (mean of a fifth of the cases)", "true share: sets with the cause")]
+    sure_of: TableRows = [("stated probability of a named cause (mean of a fifth of the cases)", "true share")]
     sure_of += [(f"{own['level']:.2f}", _rate(own)) for own in result["calibration"]["probabilities"]]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
@@ -239,11 +271,8 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
     said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
     said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
-    if (alike := result["history"]) is not None:
-        drifted, wrong = _drifted_and_distrusted(alike)
-        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
-        said.append(changed if drifted else "No parameter differs between the runs by more than their uncertainty.")
-        said += [f"Do not trust {', '.join(wrong)}, because the others agree much better without it."] if wrong else []
+    alike = result["history"]
+    said += [] if alike is None else _history_sentences(alike)
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
@@ -309,7 +338,8 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         # the message names the key of `solve`
         yield f"{name} did not converge: {message.replace('solver.', f'compare.methods.{name}.')}."
     yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
-    yield from (f"{sentence}." for sentence in result["explained"])
+    steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
+    yield next_steps_table(result, steps)
 
 
 def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]) -> Iterator[str]:
@@ -326,16 +356,13 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
             if off:
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
                 yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)} (more than 2 std away)."
-    if stopped:
-        yield f"The time limit ended {', '.join(stopped)} before the first iteration, so there are no values."
     if not fit["explains"]:
         yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not found:
         yield "No parameter can be found from these recordings, so there is nothing to agree on."
-        yield "`yid-ocp identifiability CONFIG --what-if` lists measurements that would help."
-    elif not result["agree"]:
+    elif not result["agree"] and not result["disturbed"]:
         yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
 
 
@@ -357,6 +384,44 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
     for words, key in (("wall time [s]", "wall_seconds"), ("CPU time [s]", "cpu_seconds")):
         yield words, *(f"{entry[key]:.2f}" for entry in entries)
     yield "peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)
+
+
+@register_summary("yid-friction/1")
+def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    unit, best = result["unit"], result["warranted"]
+    rows: TableRows = [("law", "held-out error", "± standard error", f"minus that of {best}", "its ±", "unit", "note")]
+    keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
+    for law, entry in result["laws"].items():
+        note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
+        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
+    chosen = result["laws"][best]
+    fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
+    joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
+    worst, noise = max(entry["mean_error"] for entry in result["laws"].values()), "; noise alone: 1" * (unit == "std")
+    text = f"For {joints}, use the law '{best}'. Its held-out error is {error} (worst law: {worst:.3g}{noise}). It is "
+    text += f"the simplest law within one standard error of the best. Each motion was held out in turn: {kinds}."
+    failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
+    yield SummaryStatement(text + failed, "conclusion")
+    if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
+        yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
+    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
+    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
+    heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
+    constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
+    for joint in result["joints"]:
+        known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
+        constants.append((joint, *(known.get(constant, "") for constant in heads)))
+    yield SummaryTable(constants, f"Friction by the law '{best}'")
+    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
+    said = f"These recordings do not determine the following parameters: {lost}."
+    yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
+    yield SummaryTable(rows, "Friction laws", is_key_table=True)
+    others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
+    yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
+    yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
+    if not result["to_use"]:
+        yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
+    yield from copyable_estimates_blocks(result)
 
 
 @register_summary("yid-history/1")
@@ -385,14 +450,10 @@ def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     yield "A run that agrees has a chi2 near its degrees of freedom. p: probability that noise alone differs as much."
 
 
-def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    drifted = [name for name, entry in history["parameters"].items() if entry["drifted"]]
-    return drifted, [entry["name"] for entry in history["runs"] if entry["distrusted"]]
-
-
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
-    p = p_value_text(result["p_value"], "= ")
+    runs, p = result["runs"], p_value_text(result["p_value"], "= ")
+    drifted = [name for name, entry in result["parameters"].items() if entry["drifted"]]
+    wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     if not drifted and result["p_value"] >= result["level"]:
         yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
     elif not drifted:
@@ -485,6 +546,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
         text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
-        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings."
+        more = "far above 1, errors of the recorded torques may also be the cause"
+        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings; {more}."
     if gate["fall"] is not None:
         yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -20,6 +21,7 @@ from yid_ocp.inference.uncertainty import (
 )
 from yid_ocp.report.terminal import (
     MAX_CHANNELS_SHOWN_SINGLY,
+    MAX_NOISE_RATIO,
     CodeBlock,
     SummaryBlockOrTextIterator,
     SummaryStatement,
@@ -29,7 +31,9 @@ from yid_ocp.report.terminal import (
     copyable_estimates_blocks,
     discretisation_shift_sentences,
     issue_summary_blocks,
+    large_torque_offsets_sentence,
     misfit_summary_blocks,
+    next_steps_table,
     register_summary,
     torque_offset_table_rows,
     unused_efforts_sentence,
@@ -43,7 +47,6 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
 _MAX_DIRECTIONS = 8
-_MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 _MAX_INITIAL_MISFIT = 30.0  # rms error at initial values, in stds of noise, up to which `check` shows finer models
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
@@ -59,7 +62,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from () if is_trusted else issues
     if converged:
         predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
-        yield from misfit_summary_blocks(result["fit"], free)
+        yield from misfit_summary_blocks(result["fit"], free, any("First set " in note for note in notes))
+        notes = (*notes, *_bound_sentences(free))
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap: " in text for text in predicted)
         said = goodness_of_fit_message(result["fit"]["chi2_per_dof"], True) if result["fit"]["explains"] else ""
         found, doubts = (*_found_and_lost(free, is_safe), said), (*notes, *predicted)
@@ -87,13 +91,36 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors on the fitted recordings")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
+    yield large_torque_offsets_sentence(result)
     yield from discretisation_shift_sentences(result)
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all" * (result["status"] == "iteration_limit")
     ended = f"{result['status'].replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
-    yield f"{ended}: {result['message']}" if converged else f"{ended}. Do not use the values."
+    yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
+    yield f"{ended}: {result['message']}" if converged else ended
+
+
+def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return the commands that help after a converged fit, by purpose."""
+    lost, notes = _names_by_verdict(free)["not_identifiable"], " ".join(result.get("discretisation_notes", ()))
+    finer = [text for text in result.get("finer_settings", {}).values() if f"First set {text}," in notes]
+    options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
+    steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
+    if not result["fit"]["explains"]:
+        steps["find the cause of the model's error"] = "diagnose"
+    elif len(lost) < len(free):
+        steps["test whether the model lacks an effect"] = "diagnose"
+    if lost:
+        steps[f"rank experiments that determine {abbreviated_names_text(lost)}"] = "identifiability --what-if"
+    if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
+        steps["compute the intervals exactly"] = "identifiability --intervals all"
+    return steps
+
+
+def _names_by_verdict(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    return {v: [name for name, own in parameters.items() if own["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
 
 
 def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
@@ -135,13 +162,13 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         text, rest = f"its rms error is {sizes[0]} on held-out recordings", f"On fitted ones it is {sizes[1]}.{guess}"
         if not result["fit"]["explains"]:
             text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
-            why = ", mostly because errors of the torques carry the arm away" * is_by_torques
+            why = ", mostly because errors of the torques carry the arm away (chi2 accounts for this)" * is_by_torques
             yield f"{text} Noise alone gives {sizes[2]}{why}.{guess}"
-        elif error > _MAX_NOISE_RATIO * noise:
+        elif error > MAX_NOISE_RATIO * noise:
             advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
             yield f"{group} shows a gap: {text}, over twice the {sizes[2]} that noise alone gives. {advice} {rest}"
-        elif error > (1.0 if is_by_torques else _MAX_NOISE_RATIO) * fitted:
-            yield f"{group} shows no gap: {text}, at most twice the {sizes[2]} that noise alone gives. {rest}"
+        elif error > (1.0 if is_by_torques else MAX_NOISE_RATIO) * fitted:
+            yield f"{group} shows no gap: {text}; noise alone gives {sizes[2]}, and up to twice this is no gap. {rest}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -149,21 +176,14 @@ def _rms(values: Sequence[float]) -> float | None:
 
 
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield held-out errors of each shown channel and recording, their median over three or more, and of baselines."""
+    """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    found: dict[str, list[tuple[str, str, float, float | None, dict[str, float]]]] = {}
     errors = []
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
             guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
             noise = entry.get("expected", {}).get(channel)
             errors.append((entry["recording"], channel, entry["rmse"][channel], noise, guesses))
-            found.setdefault(channel, []).append(errors[-1])
-    for channel, own in ((channel, own) for channel, own in found.items() if len(own) > 2):
-        guessed = [guesses for *_, guesses in own]
-        shared = [name for name in guessed[0] if all(name in each for each in guessed)]
-        medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
-        errors.append((f"median of {len(own)}", channel, statistics.median(one[2] for one in own), None, medians))
     rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
     for recording, channel, rmse, noise, guesses in errors:
         unit = channel_or_group_unit(units, channel)
@@ -171,7 +191,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         error, shown = value_text_and_display_unit(rmse, unit)
         by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
         rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
-    named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
+    named = dict.fromkeys(name for *_, guesses in errors for name in guesses)
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
@@ -193,26 +213,27 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
 
 
 def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool) -> Iterator[str]:
-    by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
-    found, weak, lost = (by[v] for v in ("identifiable", "weak", "not_identifiable"))
+    found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
         text, names = f"{text} (near zero: of a typical value)", abbreviated_names_text(found)
         yield f"Use these values within their ±: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
-        text = f"These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
-        yield f"{text} `yid-ocp identifiability FILE --what-if` lists experiments that determine more."
+        none = "Use no value. " * (len(lost) == len(free))
+        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
     if weak:
-        advice = "Use their 95 % intervals."
-        if any(free[name]["interval"] is None for name in weak):
-            advice = "Their 95 % intervals are rough; `yid-ocp identifiability FILE --intervals all` refines them."
-        yield f"These parameters are only weakly determined: {abbreviated_names_text(weak)}. {advice}"
+        rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
+        text = f"These parameters are only weakly determined: {abbreviated_names_text(weak)}."
+        yield f"{text} Use their 95 % intervals{rough}."
+
+
+def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = f"Widen parameters.{name}.bounds, or fix {name} there if the bound is a physical limit."
-                yield f"{what}, so values beyond it were not tried. {remedy}"
+                yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
 
 
 @register_summary("yid-identifiability/1")
@@ -232,31 +253,25 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
-    found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
+    found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
     said = f"{len(found)} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
-    yield SummaryStatement(f"{failed}{'At the initial values, ' * is_initial}{said}.", "conclusion")
+    start = "No fit was made, so the values are initial values. At these, " * is_initial
+    doubt = f" Only weakly determined (use the interval): {abbreviated_names_text(weak)}." * bool(weak)
+    yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield "unknown: the ± is infinite. open: any value is possible." if any("unknown" in row for row in rows) else ""
+    legend = "unknown: the ± is infinite, or has no upper end. open: any value is possible. –: no value was found."
+    yield legend if any("unknown" in row for row in rows) else ""
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    yield from (f"{w[0].upper() + w[1:] if w.startswith(('a ', 'these ')) else w}." for w in hidden[:_MAX_DIRECTIONS])
-    lost = [name for name, entry in parameters.items() if entry["verdict"] in ("weak", "not_identifiable")]
-    if lost:
-        name = f"parameters.{(unseen or lost)[0]}"
-        yield "A parameter that cannot be found has no value (–). To find more, record other motions (`yid-ocp plan`)."
-        yield f"To fix a parameter whose value is known, add --set {name}.free=false --set {name}.initial=VALUE."
+    yield from _combination_blocks(hidden[:_MAX_DIRECTIONS])
     if len(hidden) > _MAX_DIRECTIONS:
         yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
-    if is_initial:
-        yield "For estimates with intervals, omit --initial."
-    elif not result["profiles"]:
-        yield "For exact 95 % intervals, which may be asymmetric, add --intervals NAME,NAME or --intervals all."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         said = "No set of up to three changes makes it possible to find all parameters."
@@ -272,47 +287,35 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             rows.append((entry["words"], count, gain))
         yield SummaryTable(rows, "What another experiment would identify")
         yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
-    lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    said = f"Only with start and grasps taken as known can these be found: {', '.join(lost)}."
-    yield SummaryStatement(said if lost else "", "verdict")
+    only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
+    said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
+    yield SummaryStatement(said if only_known else "", "verdict")
+    steps = {"fit, for estimates with intervals": "identifiability"} if is_initial else {}
+    more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
+    steps |= {} if is_initial or result["profiles"] else more
+    if weak or lost:
+        name = f"parameters.{(unseen or lost or weak)[0]}"
+        steps["plan a motion that determines more"] = "plan --set plan.goal=information"
+        steps["fix a parameter whose VALUE is known"] = f"solve --set {name}.free=false --set {name}.initial=VALUE"
+        steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
+    yield next_steps_table(result, steps)
 
 
-@register_summary("yid-friction/1")
-def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "held-out error", "± standard error", f"minus that of {best}", "its ±", "unit", "note")]
-    keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
-    for law, entry in result["laws"].items():
-        note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
-        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
-    chosen = result["laws"][best]
-    fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
-    joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
-    worst, noise = max(entry["mean_error"] for entry in result["laws"].values()), "; noise alone: 1" * (unit == "std")
-    text = f"For {joints}, use the law '{best}'. Its held-out error is {error} (worst law: {worst:.3g}{noise}). It is "
-    text += f"the simplest law within one standard error of the best. Each motion was held out in turn: {kinds}."
-    failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
-    yield SummaryStatement(text + failed, "conclusion")
-    if unit == "std" and chosen["mean_error"] > _MAX_NOISE_RATIO:
-        yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
-    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
-    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
-    heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
-    constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
-    for joint in result["joints"]:
-        known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
-        constants.append((joint, *(known.get(constant, "") for constant in heads)))
-    yield SummaryTable(constants, f"Friction by the law '{best}'")
-    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    said = f"These recordings do not determine the following parameters: {lost}."
-    yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
-    yield SummaryTable(rows, "Friction laws", is_key_table=True)
-    others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
-    yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
-    yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
-    if not result["to_use"]:
-        yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
-    yield from copyable_estimates_blocks(result)
+def _combination_blocks(texts: Sequence[str]) -> SummaryBlockOrTextIterator:
+    """Yield sentences on combinations of parameters that cannot be found, by cause, and a table of the weak ones."""
+    alike = dict[str, list[str]]()
+    rows: TableRows = [("combined change of parameters", "± of this combined change")]
+    for text in texts:
+        what, _, spread = text.removesuffix(")").partition(" is determined only weakly (± ")
+        change, _, cause = what.removeprefix("these recordings cannot distinguish ").partition(" from ")
+        if spread:
+            rows.append((what.removeprefix("a change of "), spread))
+        else:
+            alike.setdefault(cause or change, []).append(change)
+    for cause, changes in alike.items():
+        named = f"These recordings cannot distinguish {', or '.join(changes)} from {cause}."
+        yield named if changes != [cause] else f"{cause}."
+    yield SummaryTable(rows, "Weakly determined combinations")
 
 
 @register_summary("yid-plan/1")
@@ -329,6 +332,9 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
+    steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
+    longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
+    yield next_steps_table(result, longer if not is_usable and said != done else {} if result["from"]["run"] else steps)
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -347,12 +353,12 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
         known = f"(one standard deviation; position_tolerance: {asked:g} mm)"
-        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}."
+        miss = " So the real object may miss the place." * (1e3 * max(result["std"]) > asked)
+        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}.{miss}"
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
-        said = "The uncertainty of the position is unknown, because the plan uses initial values, not estimates. To get"
-        yield f"{said} it, set plan.parameter_run_folder to a `solve` run."
+        yield "The uncertainty of the position is unknown, because the plan uses initial values, not estimates."
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -376,12 +382,9 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Effects")
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f"; it is the best of {len(starts)} searches, the next has {gains[1]:.3g} nat" if len(gains) > 1 else ""
-    yield (
-        f"By the model that `solve` uses, the motion has {best['judged']:.3g} nat of information (0.7 nat more halves "
-        f"one standard deviation{others}). By the simpler model of the search, it has {best['value']:.3g} nat; the "
-        f"random motion at its start has {best['first']:.3g} nat."
-    )
+    others = f" It is the best of {len(starts)} searches; the next has {gains[1]:.3g} nat." if len(gains) > 1 else ""
+    half = "(0.7 nat more halves one standard deviation)"
+    yield f"The motion has {best['judged']:.3g} nat of information {half}.{others}"
     reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
     yield f"The motion reaches {text}."
@@ -390,28 +393,23 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
-    if result["from"]["run"] is None:
-        yield "The forecast holds for the configured initial values. For estimates, set plan.parameter_run_folder."
+    yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    model = result["model"]
-    driven = f"{model['nu']} driven and {model['nc']} prescribed joints"
-    size = [count_with_noun(model[key], noun) for key, noun in (("n", "coordinate"), ("m", "constraint"))]
     issues, warnings = result.get("issues"), [*result["warnings"]]
     misfit, moved = result["initial_misfit"], discretisation_shift_sentences(result)
     is_far = misfit is not None and misfit > _MAX_INITIAL_MISFIT
-    warnings += [] if is_far else result["convergence"]["warnings"]
+    coarse = [] if is_far else result["convergence"]["warnings"]
     ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
     if result["recordings"]:
         ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
-    if issues or warnings:
+    if issues or warnings or coarse:
         ended = (
             f"A run is possible, but before you use its values, read the {'issues' if issues else 'warnings'} below."
         )
     yield SummaryStatement(ended, "conclusion")
-    yield f"The model has {', '.join(size)}, {driven} and {count_with_noun(model['ntheta'], 'parameter')}."
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."
     yield same if agreed else ""
@@ -439,6 +437,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
+    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in coarse)
     if is_far:
         far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
         far += "This is usual before a fit. `solve` also tests links and time step, which say little before the fit."
@@ -452,7 +451,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
-    yield from (SummaryStatement(f"warning: {text}", "verdict") for text in texts)
+    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
+    next_step = {"estimate, if the advice above is followed": "solve"} if issues or warnings or coarse else {}
+    yield next_steps_table(result, next_step if result["recordings"] else {})
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
@@ -480,7 +481,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
     text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
-    every = "Every free parameter changes a reading. `yid-ocp identifiability` shows which can be found together."
+    every = "Every free parameter changes a reading."
     yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
@@ -504,21 +505,14 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters")
     for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
         parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
-        yield SummaryTable([(head, "number", "first name", "meaning"), *parts], head.capitalize())
+        yield SummaryTable([(head, "size", "first entry", "meaning"), *parts], head.capitalize())
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
-    yield SummaryTable([*_INSPECTION_FILES, *((path, "") for path in result["exported"])], "Files")
-
-
-_INSPECTION_FILES = (
-    ("file", "holds"),
-    ("linearisation.h5", "the matrices"),
-    ("sparsity.png", "which entries of the matrices in linearisation.h5 can be nonzero"),
-    ("result.json", "the equations that contain each parameter; sizes of functions and matrices"),
-    ("equations.txt", "all equations and names"),
-)
+    files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
+    yield f"The folder has equations.txt (all equations and names), {files}."
+    yield next_steps_table(result, {"show which can be found together": "identifiability"} if changes else {})
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -555,10 +549,11 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
     else:
-        said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. To use it, list it under "
-        yield SummaryStatement(f"{said}recordings.estimate of a configuration.", "verdict")
+        yield SummaryStatement(f"The file recording.h5 has {result['duration']:g} s of simulated motion.", "verdict")
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
+        option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
+        yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
 
 
 @register_summary("yid-track/1")
@@ -571,9 +566,9 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
-    good, spent = sum(not frame["reason"] for frame in result["frames"]), 1e3 * result["fit_seconds"]
-    used = f"{good} of {len(result['frames'])} images are used, and recording.h5 has their points."
-    yield SummaryStatement(result["refused"] or f"{used} One fit took {spent:.0f} ms.", "verdict")
+    used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
+    used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Points", is_key_table=True)
     for why, n in result["dropped"].items():
         of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, LIMIT_VIOLATION_RATIO_CAP, mean_sample_rate
+from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
 from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
@@ -26,6 +27,7 @@ _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
 _MAX_NUMBERS_BEYOND_MODEL = 6  # parameters that a sentence on a poor fit lists; the table has all
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
+MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and largest length of a note that stays on one line."""
@@ -103,15 +105,14 @@ def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, st
 def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
     issues = result.get("issues", ())
-    rows: TableRows = [("issue", "where", "is it an error?", "times the limit")]
+    rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in issues):
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
             left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
             where = entry["where"] + f" and {left} more" * bool(left)
-            has_limit = 1.0 < entry["evidence"] < LIMIT_VIOLATION_RATIO_CAP  # else a fact, or only a suspicion
-            rows.append((words, where, entry["certainty"], f"{entry['evidence']:.3g}" if has_limit else "–"))
+            rows.append((words, where, entry["certainty"]))
             do = entry["advice"][:1].upper() + entry["advice"][1:]
             do += " by this line of the configuration:" if entry["setting"] else "."
             place = f" ({where.partition('/')[0]})" if len(alike) > 1 else ""
@@ -119,9 +120,20 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterato
     if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {'; '.join(severe)}.", "verdict")
     if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
-        yield f"These issues change no verdict. Before you use values, follow the advice on them: {'; '.join(mild)}."
+        yield f"These issues change no verdict. Use values after you have followed the advice on: {'; '.join(mild)}."
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
+
+
+def next_steps_table(result: Mapping[str, Any], steps: Mapping[str, str]) -> SummaryTable:
+    """Return a table of command lines for the configuration of a result, from commands and options by purpose."""
+    words = shlex.split(result.get("command", "yid-ocp solve CONFIG"))[2:3]
+    config = shlex.join(word for word in words if not word.startswith("--"))
+    rows: TableRows = [("next step", "command")]
+    for purpose, text in steps.items():
+        command, _, options = text.partition(" ")
+        rows.append((purpose, " ".join(filter(None, ("yid-ocp", command, config, options)))))
+    return SummaryTable(rows, "Next steps")
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -141,16 +153,18 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
 
 
 def misfit_summary_blocks(
-    fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]
+    fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]], is_coarse: bool = False
 ) -> SummaryBlockOrTextIterator:
     """Yield statements on a poor fit: misfit, parameters that are still meaningful, channels worse than a baseline.
 
-    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value.
+    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value, and
+    the model is not `is_coarse`: finer links or time steps explain the recordings no better.
     """
     if not fit["explains"]:
-        yield SummaryStatement(uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
+        said = uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False)
+        yield SummaryStatement("Do not use the values yet. " * is_coarse + said, "conclusion")
         doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
-        if doubted and fit["data_trusted"]:
+        if doubted and fit["data_trusted"] and not is_coarse:
             known = []
             for name, entry in doubted.items():
                 relative = entry.get("std_relative")
@@ -195,6 +209,14 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
             end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")
             said.append(f"With {words}, no estimate would change by more than its ± from the recordings{end}")
     return said + ([f"To reduce these errors, set {' and '.join(cures)}{again}."] if cures else [])
+
+
+def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
+    """Return a sentence on joints whose torque offset is over twice its expected size. Empty if there are none."""
+    every = (pair for entry in result.get("torque_offsets", {}).values() for pair in entry.items())
+    large = dict.fromkeys(joint for joint, own in every if abs(own["value"]) > 2 * own["prior_std"])
+    do = "The estimates take this into account. Check the calibration of the torque sensor."
+    return f"The torque offset of {', '.join(large)} is over twice the expected size. {do}" if large else ""
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:

@@ -108,10 +108,9 @@ def run_batch(
 ) -> CommandOutcome[None]:
     """Run `command` (`solve` or `diagnose`) for each of `members`, from `batch_runs_from_configs`.
 
-    Finished runs in the folder `out` are reused. The batch is successful if all runs are. The folder contains
-    `runs/NAME/` (run folders), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`, with
-    the reason of each failed run) and `report.html`, which shows `command_line`. Raises `OutputError` if `out` holds
-    other files or cannot be created; `ParallelWorkError` as in `run_tasks`.
+    Finished runs in the folder `out` are reused. The batch is successful if all runs are. docs/howto/workers.md has the
+    files of the folder; its page shows `command_line`. Raises `OutputError` if `out` holds other files or cannot be
+    created; `ParallelWorkError` as in `run_tasks`.
     """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)

@@ -93,11 +93,7 @@ def run_blind(
     are used as `count` allows. `seed` and `purpose` ('report' or 'calibration') determine the cases. With `part` (K,
     N), only every N-th case is made and diagnosed, in the folder `slice-K-of-N`. Finished parts in `out` are reused.
 
-    The folder contains `configs/`, `prepared/` (detectable sizes per experiment), `cases/` (recordings),
-    `sealed/labels.json`, `commitment.json` (hashes of the labels, written before the first diagnosis, and of the
-    sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), `slice.json`
-    (`yid-blind-slice/1`: labels, answers, hashes, for `score_joined_slices`), `result.json` (`yid-blind/1`), `table.md`
-    and pictures. A calibration ensemble has `thresholds.json`. Raises `OutputError` for a folder of another ensemble.
+    docs/howto/blind.md has the files of the folder. Raises `OutputError` for a folder of another blind test.
     """
     for what, number, where, least in (("number of cases", count, "--cases", 1), ("seed", seed, "--seed", 0)):
         if number < least:

@@ -44,7 +44,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             progress.report_iterate(entry)
 
         limits, budget = run.diagnosis.fit_excess_residual_criteria, run.compare.total_time_budget
-        comparison = compare_methods(problem, solvers, truth, iterate, limits, math.inf if budget is None else budget)
+        comparison = compare_methods(problem, solvers, iterate, limits, math.inf if budget is None else budget)
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
@@ -53,7 +53,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             known = attributes_to_dict(tried, "whitened_cost wall_seconds cpu_seconds peak_memory_mib")
             known["disagreements"] = comparison.disagreements[tried.method]
             methods[tried.method] = solution_to_result_dict(problem, tried.solution, tried.held_out_predictions) | known
-        keys = "reference=reference_method agree=is_consistent explained=explanations disturbed=has_process_noise"
+        keys = "reference=reference_method agree=is_consistent disturbed=has_process_noise"
         result = attributes_to_dict(comparison, keys) | {
             "format": "yid-compare/1",
             "methods": methods,

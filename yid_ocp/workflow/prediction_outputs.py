@@ -159,13 +159,7 @@ EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, Episo
 def write_solve_trajectories(
     path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> None:
-    """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1` (HDF5).
-
-    `unknowns/`: `x`, `covariance`, attribute `names`. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n),
-    `multipliers` (N, m) [N s], `torque` (N, nu) [N m] or, for servos, `command` (N, nu) [rad or m] (NaN while a motor
-    is off), `effort` (N, nc) [N m], attributes `joints` (n names), `driven` (nu), `prescribed` (nc); for every sensor
-    `GROUP/` with `t`, `measured`, `predicted`, `std`, attributes `channels`, `unit`. Raises `OutputError` on failure.
-    """
+    """Write trajectories, predictions and unknowns (HDF5, arrays: docs/howto/signals.md). Raises `OutputError`."""
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
         done = solution.episode_predictions
@@ -196,18 +190,7 @@ def write_solve_trajectories(
 def write_diagnosis_hdf5(
     path: Path, result: DiagnosisResult, pairs: Sequence[EpisodeWithNominalAndEffectPredictions]
 ) -> None:
-    """Write held-out predictions, smoothed unknowns and event forces as `yid-diagnosis-trajectories/1` (HDF5).
-
-    `RECORDING/GROUP/` of held-out recordings: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k), `channels`.
-
-    `where/RECORDING/`, for every estimation recording with a gap to locate: `edges` (J + 1,) of the intervals with
-    constant unknowns [s since the first node]; `mean` and `std` (J, nd) of the unknown forces, offsets and biases about
-    the nominal model; `prior` (nd,), their standard deviation at the largest evidence (zero: group not used); the
-    attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each, and `start`, the time of the first node [s].
-
-    `events/RECORDING/CHANNEL/`, for every event force: `t` (M,) [s], `value` (M,) of the force beyond model and
-    recording, `allowed` (M,), the assumed model error; the attribute `unit`. Raises `OutputError`.
-    """
+    """Write predictions, smoothed unknowns and event forces (arrays: docs/howto/signals.md). Raises `OutputError`."""
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = DIAGNOSIS_TRAJECTORIES_FORMAT
         for episode, before, after in pairs:

@@ -38,9 +38,8 @@ def run_simulate(
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model at the initial
     parameter values, and every sensor is predicted at its sample times. Without a recording, MuJoCo simulates a random
-    motion of the driven arms, as a virtual experiment. If the rollout fails, no recording is written. `noise` adds
-    noise with the recorded standard deviations to the predictions (a virtual experiment always has noise). `seed`
-    determines the motion and the noise.
+    motion of the driven arms, as a virtual experiment, which always has noise. If the rollout fails, no recording is
+    written. `noise` adds noise with the recorded standard deviations. `seed` determines the motion and the noise.
     """
     with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
@@ -56,6 +55,7 @@ def run_simulate(
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             result |= {"status": "done", "message": "", "duration": recording.duration}
+            result["file"] = str(folder.final_path / "recording.h5")
             result |= {"groups": groups, "truth": dict(recording.true_parameters)}
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)

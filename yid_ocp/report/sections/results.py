@@ -281,6 +281,8 @@ def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tu
     for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
         sensor, course = samples.sensor, None
         t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
+        if len(t) == 0:
+            continue
         if sensor.point_names and len(t) < grid.steps / 2:
             # readings of a slow sensor at every node
             values = own.problem.predictor.rollout_node_values(own.prediction.rollout)
