@@ -99,8 +99,7 @@ def run_blind(
         if number < least:
             what, allowed = f"the {what} is {number}, but must be at least {least}", f"a whole number from {least}"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"leave {where} out, or give a larger number")
-    for entry in runs:
-        _require_compatible(entry)
+    runs = list(map(_with_simulated_noise, runs))
     names = [entry.name for entry in runs]
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -441,17 +440,14 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
     return run, ensemble
 
 
-def _require_compatible(run: RunSettings) -> None:
-    stated = [f"sensors.{name}.std" for name, entry in run.sensors.items() if entry.std is not None]
-    stated += ["diagnosis.noise_fraction_of_stated_std"] * (run.diagnosis.noise_fraction_of_stated_std < 1)
-    if stated:
-        what = f"a blind test adds noise of its own, but the settings state noise: {', '.join(stated)}"
-        allowed, hint = "settings without these keys", "remove these keys, for example in a copy of the file"
-        raise run.config_error(what, "sensors", allowed=allowed, hint=hint)
+def _with_simulated_noise(run: RunSettings) -> RunSettings:
+    """Return the settings without stated noise, which simulated recordings do not have. Raises `ConfigError`."""
     system = build_system(run)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, servo", hint=hint)
+    sensors = {name: replace(own, std=None) for name, own in run.sensors.items()}
+    return replace(run, sensors=sensors, diagnosis=replace(run.diagnosis, noise_fraction_of_stated_std=1.0))
 
 
 def _blind_experiments_and_refinable_subset(
