@@ -107,8 +107,7 @@ def recorded(seed: int, amplitudes: Mapping[str, float]) -> Recording:
     effects = [InjectedEffect(kind, "joint", size) for kind, size in sizes.items()]
     made = run_experiment_with_injected_effects(system, values, effects, experiment, ())
     assert made.joints is not None
-    joints = replace(made.joints, proportional_gain=400.0)
-    return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters={})
+    return replace(made, joints=replace(made.joints, velocity=None, velocity_std=None), true_parameters={})
 
 
 def of_law(law: str) -> dict[str, float]:

@@ -76,8 +76,7 @@ def recorded(system: System, seed: int) -> Recording:
     friction = [InjectedEffect(kind, joint, size) for joint in POSTURE for kind, size in laws.items()]
     made = run_experiment_with_injected_effects(system, values, [], experiment, friction)
     assert made.joints is not None
-    joints = replace(made.joints, proportional_gain=GAIN)
-    return replace(made, joints=replace(joints, velocity=None, velocity_std=None), true_parameters=TRUTH)
+    return replace(made, joints=replace(made.joints, velocity=None, velocity_std=None), true_parameters=TRUTH)
 
 
 def written(folder: Path, seeds: Sequence[int]) -> list[str]:

@@ -243,13 +243,14 @@ class BlindCaseGenerator:
         system, priors = self.problem.system, self.problem.options.prior_stds
         start = dict(zip(system.parameters.names, map(float, self.problem.theta), strict=True))
         drawn = {name: start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1) for name in self.problem.free}
+        stated = self.problem.episodes[0].known_parameters
         for name in (own for own in drawn if own in priors):  # a set would have another order in each process
             drawn[name] = start[name] + priors[name] * rng.uniform(*_PRIOR_DEVIATIONS) * rng.choice([-1.0, 1.0])
         for effect in self._ordinary_friction:
             drawn |= {name: start[name] for name in effect.shape_parameter_names}
             for name in effect.amplitude_parameter_names:
                 drawn[name] = rng.uniform(*typical_friction_amplitude_range(effect, system))
-        return {name: float(value) for name, value in drawn.items()}
+        return {name: float(value) for name, value in {**drawn, **stated}.items()}
 
     @property
     def _ordinary_friction(self) -> tuple[EffectBase, ...]:
@@ -320,6 +321,7 @@ class BlindCaseGenerator:
     def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
+        values |= nominal.episodes[0].known_parameters
         # motions differ between cases; a filter for the first recording could remove motion of the others
         cutoff = max(nominal.options.path_cutoff, select_path_cutoff(recordings, nominal.system.prescribed))
         options = replace(nominal.options, path_cutoff=cutoff)

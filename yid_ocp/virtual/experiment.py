@@ -17,6 +17,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_
 from yid_ocp.effects.base import joint_names_by_arm
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.objects.foam_y import foam_y_object
+from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo
@@ -163,9 +164,12 @@ def recording_from_simulation(
         groups.append(PointGroup("points_arm", held, run.t, position, std, "arm"))
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
-    theta = zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True)
-    truth = {name: value for name, value in theta if name.rpartition(".")[2] in _TRUE_QUANTITIES}
+    theta = dict(zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True))
+    truth = {name: value for name, value in theta.items() if name.rpartition(".")[2] in _TRUE_QUANTITIES}
     made, joints = _how_it_was_made(chosen, system), _joints(system, run, chosen, streams)
+    gains = [f"{name}.{JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX}" for name in system.driven]
+    if {*gains} & {*theta}:  # the gain set in the firmware of servos
+        joints = replace(joints, proportional_gain=np.array([theta.get(name, 1.0) for name in gains]))
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
     return validated_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
 

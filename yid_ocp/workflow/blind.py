@@ -31,6 +31,7 @@ from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
+from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmImperfections
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
@@ -400,6 +401,7 @@ class _BlindExperiment:
         system = build_system(self.simulation_settings())
         vision = not varied.is_without_object and any(group.camera_pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
+        values |= servo_gain_parameters_by_recording(system, first).get(first[0].name, {})
         conditions = replace(self._recording_conditions(), has_camera=vision)
         posture = blind.first_recorded_driven_joint_positions(system, first[0])
         for attempt in range(blind.MAX_DRAWS_PER_CASE):
