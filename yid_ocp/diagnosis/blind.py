@@ -22,7 +22,7 @@ from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, ProjectedCandida
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
-from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.errors import ConfigError, DataError, ModelError, YidError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
@@ -340,12 +340,14 @@ class BlindCaseGenerator:
                     self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", planned)
                     for purpose in (*purposes, "held_out")
                 )
-            except ModelError:
-                continue  # this motion cannot be simulated; draw another
+            except YidError as error:
+                lately = error.what  # this motion cannot be simulated or recorded; draw another
+                continue
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
-        what, allowed = f"all {MAX_DRAWS_PER_CASE} random motions diverge in MuJoCo", "one motion that stays finite"
+        what = f"MuJoCo simulated none of {MAX_DRAWS_PER_CASE} random motions, lately because {lately}"
+        allowed = "one motion that stays finite"
         where, hint = f"{name} of experiment {planned.experiment}", "set another --seed; next, a larger model.damping"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 

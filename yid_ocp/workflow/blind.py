@@ -45,7 +45,7 @@ _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments 
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
 """Standard deviations [N m] of the torques' white noise and constant offsets, in experiments with torque noise."""
 _PRESCRIBED_SIGN_SMOOTHING_SPEED = 0.005  # of nominal friction, for joints that stand still under a load [rad/s]
-_SERVO_SIGN_SMOOTHING_SPEED = 0.001  # likewise, of joints with servos, whose encoders show the creep of slower ones
+_SERVO_SIGN_SMOOTHING_SPEED = 2e-4  # likewise, of joints with servos, whose encoders show even slow creep
 _NO_ANSWER = {"effects": [], "which": [], "where": [], "confusable": [], "gap": {"closure": None}}
 log = logging.getLogger(__name__)
 
@@ -408,12 +408,13 @@ class _BlindExperiment:
             rng = np.random.default_rng([self.seed, blind.BLIND_ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
                 made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
-            except ModelError:
-                continue  # the motion throws the object about; draw another
+            except YidError as error:
+                lately = error.what  # such as a motion that throws the object about; draw another
+                continue
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
         hint = "set a larger model.damping, or give a recording that begins where the object hangs in equilibrium"
-        what = f"MuJoCo could simulate none of {blind.MAX_DRAWS_PER_CASE} random motions"
+        what = f"MuJoCo simulated none of {blind.MAX_DRAWS_PER_CASE} random motions, lately because {lately}"
         where, allowed = f"{self.config_file.name}, {varied.description}", "one motion that MuJoCo can simulate"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
