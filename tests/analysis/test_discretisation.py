@@ -199,6 +199,8 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     assert notes == []
     assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
     assert {entry.links for entry in told.values()} == {None}
+    left = predicted_refit_residual_at_finer_step(fine, coarse, found.x, found.evaluation, True)
+    np.testing.assert_allclose(left, finer.evaluation.residual, atol=1e-6)
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose(

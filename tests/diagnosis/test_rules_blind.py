@@ -55,7 +55,7 @@ def problem(of=None):
         system=of or system(),
         free=("T1.bend", "T2.bend"),
         theta=np.array([20.0, 5.0, 0.05]),
-        episodes=(SimpleNamespace(recording=recording),),
+        episodes=(SimpleNamespace(recording=recording, known_parameters={"T1.damping": 0.07}),),
         step="step",
         options=ProblemOptions(),
     )
@@ -160,6 +160,7 @@ def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(d
     [injected] = told.injected
     assert [made["injected"] for made in drawn.made] == [(injected,)] * 2
     assert [made["truth"] for made in drawn.made] == [told.truth] * 2
+    assert told.truth["T1.damping"] == 0.07  # as the recording states
     assert case.excluded_kinds[0] not in (injected.kind, "")
     assert told.multiple is not None
 
@@ -287,7 +288,7 @@ def test_parameters_with_priors_are_drawn_in_their_order_so_that_a_seed_draws_th
     counted = Mock(uniform=lambda *_: next(draws), choice=lambda _: 1.0, integers=lambda _: 0)
     monkeypatch.setattr(np.random, "default_rng", lambda seed: counted)
     truth = of_category(ensemble, "null")[1].truth
-    assert [truth[name] for name in names] == sorted(truth.values())
+    assert [truth[name] for name in names] == sorted(truth[name] for name in names)
 
 
 def test_what_a_plan_cannot_divide_goes_to_the_largest_remainders():

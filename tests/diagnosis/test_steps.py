@@ -13,6 +13,7 @@ from made_series import series
 
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.pulse_detection import CompiledInverseDynamics
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import (
     ProjectedCandidatesLinearization,
@@ -107,6 +108,13 @@ def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_n
     assert 0 < coulomb < 0.1
 
 
+def test_torques_at_a_node_do_not_depend_on_how_often_it_is_asked(screened):
+    own, run = screened[1].problem, screened[1].evaluation.episode_predictions[0].rollout
+    read = CompiledInverseDynamics(own.step).inverse_dynamics_term_magnitudes
+    once, twice = (vars(read(own.theta, run, np.array(nodes))) for nodes in ([1, 4, 9], [1, 4, 4, 9]))
+    assert all(np.array_equal(once[name][[0, 1, 1, 2]], twice[name]) for name in once)
+
+
 @pytest.mark.parametrize(("lean", "chosen"), [(0.0, 0), (1e-10, 0), (0.01, 1)])
 def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, chosen):
     effect = make_effect("joint_stribeck", "elbow", bench.system)
@@ -125,8 +133,19 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
 def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch):
     """Such as efforts, in which the noise of accelerations depends on the step."""
     problem = Mock(residual_rows=Mock(measurements=[[slice(0, 2), slice(2, 4)]]), step=Mock(time_step=0.01))
-    monkeypatch.setattr(diagnose, "problem_corrected_for_events", lambda *_: problem)
+    monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: problem)
     forecast, name = np.array([1.0, 1.0, 9.0, 9.0]), "predicted_refit_residual_at_finer_step"
     monkeypatch.setattr(diagnose.discretisation, name, lambda *_: forecast)
     fit = Mock(problem=problem, evaluation=Mock(residual=np.full(4, 2.0)), at_estimates=())
     assert diagnose._fall_at_half_time_step(Mock(), fit, None, False) == pytest.approx(8.0 - 2.0)
+
+
+def test_a_gap_without_a_cause_is_refitted_with_half_the_time_step(monkeypatch):
+    """The forecast from a fit in a wrong minimum does not show what the shorter step changes."""
+    asked, seen = [], Mock(is_corrected_for_links=False)
+    seen.evidence.screening.largest_predicted_chi2_decrease, seen.search.thresholds.min_log_bayes_factor = 50.0, 5.0
+    monkeypatch.setattr(diagnose, "_fall_at_half_time_step", lambda *given: asked.append(given[-1]) or 26.0)
+    monkeypatch.setattr(diagnose, "_at_half_time_step", lambda *_: "finer")
+    for verdict, found in (("unknown", "finer"), ("no_gap", seen)):
+        assert diagnose._examined_anew(seen, Mock(selected_effects=(), verdict=verdict)) == found
+    assert asked == [True]
