@@ -255,16 +255,37 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
 
 
 def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
-    """Return issues about drifting clocks and overstated sensor noise, found in the residuals of a fit at `x` (nx,).
+    """Return issues about late and drifting clocks, and overstated sensor noise, found in a fit at `x` (nx,).
 
-    Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
-    the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
+    An offset is an issue if it far exceeds the size that the fit expects, or if it grows during a recording. A smaller
+    one has the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
     """
     if not evaluation.ok or evaluation.jacobian is None or problem.stated_rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
-    found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
+    found = [*_late(problem, evaluation), *_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
     return [issue for issue in found if (issue.cause, issue.recording, issue.group) not in known]
+
+
+def _late(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
+    """Yield issues for groups of points whose clock is far later or earlier than the fit expects."""
+    for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True):
+        for samples, path in zip(episode.measurements, result.predicted_outputs, strict=True):
+            if samples.change_by_clock is None:
+                continue
+            name, seen = samples.sensor.group_name, samples.positive_weight_mask
+            rate = (samples.weight * np.gradient(path, times_since_recording_start(episode, samples), axis=0))[seen]
+            by_std = (samples.weight * samples.change_by_clock)[seen]
+            shift = float(by_std @ (samples.weight * (path - samples.value))[seen] / (by_std @ by_std + 1.0))
+            if (ratio := abs(shift) / _MIN_Z) > 1:
+                std = float(np.linalg.norm(by_std) / np.linalg.norm(rate))
+                size = f"{abs(shift) * std:.2g}"
+                what = f"the fit finds time stamps of {name} {size} s {'late' if shift > 0 else 'early'}, but expects "
+                what += f"{1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
+                advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
+                line = f"sensors.{name}.clock_offset_std: {size}"
+                recording = episode.recording.name
+                yield Issue("clock_offset", what, "warning", ratio, advice, recording, name, "t", setting=line)
 
 
 def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
