@@ -197,18 +197,14 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
 
 def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path) -> None:
     link = '<link name="{0}"/><joint name="{0}" type="{1}"><parent link="hub"/><child link="{0}"/>{2}</joint>'
-    finger = link.format("finger", "prismatic", '<limit lower="0" upper="0.04" effort="9" velocity="1"/>')
-    whole = (
-        (bench / "wrist.urdf").read_text().replace("</robot>", f"{finger}{link.format('hub_tcp', 'fixed', '')}</robot>")
-    )
-    (bench / "wrist.urdf").write_text(whole)
+    more = link.format("finger", "prismatic", '<limit lower="0" upper="0.04" effort="9" velocity="1"/>')
+    more += link.format("hub_tcp", "fixed", "") + "</robot>"
+    (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", more))
     made = moved(SHORT)
-    for opening, holder in ((np.full(len(SHORT), 0.01), "hub_tcp"), (0.04 * (SHORT > 1), "finger")):
+    for opening, holder, locked in ((np.full(len(SHORT), 0.01), "hub_tcp", {"finger": 0.01}), (SHORT, "finger", {})):
         position = np.column_stack([made.joints.position, opening])
-        joints = JointGroup((*made.joint_names, "finger"), SHORT, position)
-        model = proposed(replace(made, joints=joints)).model
-        assert model.object.mount.parent_frame == holder
-        assert model.arms.locked_joints == ({"finger": 0.01} if holder == "hub_tcp" else {})
+        model = proposed(replace(made, joints=JointGroup((*made.joint_names, "finger"), SHORT, position))).model
+        assert (model.object.mount.parent_frame, model.arms.locked_joints) == (holder, locked)
 
 
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +29,8 @@ _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 class _MotionLag(NamedTuple):
     lag: float
     explained: float
-    explained_unshifted: float
-    contrast: float
+    left_ratio: float  # of the errors with and without the lag
+    is_clear: bool
 
 
 def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
@@ -104,7 +105,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
             return 0.0, f"{said}, so nothing was shifted. But {late}"
         return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
     best = _motion_lag(first, other, begin - start)
-    if best is None or best.contrast < _MIN_CONTRAST:
+    if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
         hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
@@ -118,14 +119,12 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
 def _late_points(first: Recording, other: Recording, name: str, applied: float) -> str:
     """What is said if the points of `other` clearly follow the joints of `first` better with another shift."""
     best = _motion_lag(first, other)
-    if best is None or best.contrast < _MIN_CONTRAST or abs(best.lag) < _MIN_SAID_LAG:
+    if best is None or not best.is_clear or best.left_ratio > _MAX_LEFT_RATIO or abs(best.lag) < _MIN_SAID_LAG:
         return ""
-    if 1 - best.explained >= _MAX_LEFT_RATIO * (1 - best.explained_unshifted):
-        return ""
-    said = (
-        f"{LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): their clock is "
+    said = f"{LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): their clock "
+    said += (
+        "is off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the clock, "
     )
-    said += "off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the clock, "
     return f"{said}import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
 
 
@@ -151,10 +150,7 @@ def _motion_lag(first: Recording, other: Recording, shift: float = 0.0) -> _Moti
     if seen_path is None or joints is None or len(joints.t) < _MIN_SAMPLES:
         return None
     t, path = seen_path[0] + shift, seen_path[1]
-
-    def sums(a: Array, b: Array) -> Array:
-        return signal.correlate(b, a, method="fft")  # over the common samples, for every lag of b
-
+    sums = partial(signal.correlate, method="fft")  # over the common samples, for every lag of the first argument
     moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
     spans = joints.t[-1] - joints.t[0], t[-1] - t[0]
     period = max(0.005, median_sample_period(joints.t), median_sample_period(t), max(spans) / _MAX_GRID)
@@ -166,11 +162,11 @@ def _motion_lag(first: Recording, other: Recording, shift: float = 0.0) -> _Moti
     x = np.stack([np.interp(grid, joints.t, column) for column in (moving - moving.mean(axis=0)).T])
     y = seen * np.stack([np.interp(even, t, column) for column in (path - path.mean(axis=0)).T])
     whole = np.ones(len(grid))
-    n = np.maximum(np.rint(sums(whole, seen)), 1.0)
-    sum_x, sum_y = np.array([sums(a, seen) for a in x]), np.array([sums(whole, b) for b in y])
-    xx = np.array([[sums(a * b, seen) for b in x] for a in x]) - sum_x[:, None] * sum_x / n
-    xy = np.array([[sums(a, b) for b in y] for a in x]) - sum_x[:, None] * sum_y / n
-    yy = sums(whole, np.sum(y**2, axis=0)) - np.sum(sum_y**2, axis=0) / n
+    n = np.maximum(np.rint(sums(seen, whole)), 1.0)
+    sum_x, sum_y = np.array([sums(seen, a) for a in x]), np.array([sums(b, whole) for b in y])
+    xx = np.array([[sums(seen, a * b) for b in x] for a in x]) - sum_x[:, None] * sum_x / n
+    xy = np.array([[sums(b, a) for b in y] for a in x]) - sum_x[:, None] * sum_y / n
+    yy = sums(np.sum(y**2, axis=0), whole) - np.sum(sum_y**2, axis=0) / n
     used = n >= _MIN_SHARED_FRACTION * min(len(grid), seen.sum())
     lags = (signal.correlation_lags(len(even), len(grid)) * period + (even[0] - grid[0]))[used]
     xx, xy, n, yy = np.moveaxis(xx, 2, 0)[used], np.moveaxis(xy, 2, 0)[used], n[used], yy[used]
@@ -179,8 +175,9 @@ def _motion_lag(first: Recording, other: Recording, shift: float = 0.0) -> _Moti
     support = -np.log1p(-explained) * n
     best = int(np.argmax(support))
     far = np.max(support, where=np.abs(lags - lags[best]) > _NEAR_LAGS, initial=0.0)
-    unshifted = float(explained[np.argmin(np.abs(lags))])
-    return _MotionLag(float(lags[best]), float(explained[best]), unshifted, float((support[best] - far) / n[best]))
+    left = (1 - explained[best]) / (1 - explained[np.argmin(np.abs(lags))])
+    is_clear = bool(support[best] - far >= _MIN_CONTRAST * n[best])
+    return _MotionLag(float(lags[best]), float(explained[best]), float(left), is_clear)
 
 
 def _seen_path(recording: Recording) -> tuple[Array, Array] | None:

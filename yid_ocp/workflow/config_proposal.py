@@ -236,16 +236,17 @@ def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
 
 def _resting_fingers(tree: Mechanism, recorded: JointGroup, recordings: Sequence[Recording]) -> dict[str, float]:
     """Median positions of end joints that rest in all recordings, and before which a frame is more like a tool."""
-    ranks = {
-        j: [_tool_rank(name)[0] for name, at in tree.frames.items() if at.joint_index == j]
-        for j in range(-1, len(tree.joints))
+
+    def rank(joint: str) -> int:
+        return min(_tool_rank(name)[0] for name, at in tree.frames.items() if at.joint_index == tree.joint_index(joint))
+
+    return {
+        name: round(float(np.median(recorded.position[:, recorded.names.index(name)])), 4)
+        for *before, name in (arm.joints for arm in _arms(tree))
+        if before
+        and rank(before[-1]) < rank(name)
+        and max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL
     }
-    fingers = dict[str, float]()
-    for *before, name in (arm.joints for arm in _arms(tree)):
-        rests = all(_travel(recording, [name]) < _MIN_FRICTION_TRAVEL for recording in recordings)
-        if before and rests and min(ranks[tree.joint_index(before[-1])]) < min(ranks[tree.joint_index(name)]):
-            fingers[name] = round(float(np.median(recorded.position[:, recorded.names.index(name)])), 4)
-    return fingers
 
 
 def _tool_rank(frame: str) -> tuple[int, bool]:
