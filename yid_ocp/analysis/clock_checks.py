@@ -263,32 +263,26 @@ def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, 
     if not evaluation.ok or evaluation.jacobian is None or problem.stated_rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
-    found = [*_late(problem, evaluation), *_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
+    found = [*_clocks(problem, x, evaluation), *_overstated(problem, evaluation)]
     return [issue for issue in found if (issue.cause, issue.recording, issue.group) not in known]
 
 
-def _late(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
-    """Yield issues for groups of points whose clock is far later or earlier than the fit expects."""
-    for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True):
-        for samples, path in zip(episode.measurements, result.predicted_outputs, strict=True):
-            if samples.change_by_clock is None:
-                continue
-            name, seen = samples.sensor.group_name, samples.positive_weight_mask
-            rate = (samples.weight * np.gradient(path, times_since_recording_start(episode, samples), axis=0))[seen]
-            by_std = (samples.weight * samples.change_by_clock)[seen]
-            shift = float(by_std @ (samples.weight * (path - samples.value))[seen] / (by_std @ by_std + 1.0))
-            if (ratio := abs(shift) / _MIN_Z) > 1:
-                std = float(np.linalg.norm(by_std) / np.linalg.norm(rate))
-                size = f"{abs(shift) * std:.2g}"
-                what = f"the fit finds time stamps of {name} {size} s {'late' if shift > 0 else 'early'}, but expects "
-                what += f"{1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
-                advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
-                line = f"sensors.{name}.clock_offset_std: {size}"
-                recording = episode.recording.name
-                yield Issue("clock_offset", what, "warning", ratio, advice, recording, name, "t", setting=line)
+def _late(samples: SensorMeasurements, speed: Array, path: Array, recording: str) -> Iterator[Issue]:
+    """Yield an issue if the clock of points with the whitened `speed` is far later or earlier than the fit expects."""
+    if samples.change_by_clock is not None:
+        seen, name = samples.positive_weight_mask, samples.sensor.group_name
+        by_std, left = ((samples.weight * x)[seen] for x in (samples.change_by_clock, path - samples.value))
+        stds, std = float(by_std @ left / (by_std @ by_std + 1)), float(np.linalg.norm(by_std) / np.linalg.norm(speed))
+        size = f"{abs(stds) * std:.2g}"
+        what = f"the fit finds time stamps of {name} {size} s {'late' if stds > 0 else 'early'}, but expects "
+        what += f"{1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
+        advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
+        if (ratio := abs(stds) / _MIN_Z) > 1:
+            line = f"sensors.{name}.clock_offset_std: {size}"
+            yield Issue("clock_offset", what, "warning", ratio, advice, recording, name, "t", setting=line)
 
 
-def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
+def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
     for series in channels_with_residual_indices(problem):
@@ -307,6 +301,7 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
             speed = _by_lateness(problem, x, i, samples, result)[samples.positive_weight_mask]
+            yield from _late(samples, speed, result.predicted_outputs[k], episode.recording.name)
             columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:

@@ -524,10 +524,8 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
 
 def _time_step(period: float) -> float:
     """Return a time step [s] of at most `_MAX_TIME_STEP`: whole sample periods or, for slow clocks, a part of one."""
-    if period <= _MAX_TIME_STEP:
-        step = period * max(1, math.floor(_MAX_TIME_STEP / period + 1e-3))
-    else:
-        step = period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
+    whole = math.floor(_MAX_TIME_STEP / period + 1e-3)
+    step = period * whole if whole else period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
     return float(f"{step:.3g}")
 
 
