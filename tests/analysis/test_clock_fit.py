@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.clock_checks import problem_with_fitted_clocks_and_issues
+from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, problem_with_fitted_clocks_and_issues
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
@@ -71,6 +71,12 @@ def test_damping_is_right_where_markers_are_late(tmp_path):
     before, after = (fit.goodness_of_fit.chi2_per_dof for fit in fits)
     assert before > 1.5
     assert after == pytest.approx(1.0, abs=0.15)
+    unstated = [replace(own, points=(replace(own.points[0], clock_offset_std=None),)) for own in far[:2]]
+    for recordings, said in ((late, []), (unstated, ["0.03 s late"])):
+        problem = EstimationProblem(step, recordings, tuple(truth), told)
+        fit = fit_problem(problem, GaussNewton())
+        doubts = clock_and_noise_issues_from_residuals(problem, fit.x, fit.evaluation)
+        assert [doubt.what.partition("points ")[2].partition(",")[0] for doubt in doubts] == said
     found = {std: fit_problem(problem, GaussNewton()).parameters for std, problem in problems.items()}
     off = {std: (own["elbow.damping"].value - 0.02) / own["elbow.damping"].std for std, own in found.items()}
     assert all(found[std][name].verdict == "identifiable" for std in (None, "fitted") for name in truth)

@@ -86,6 +86,9 @@ def test_a_joint_that_stands_between_two_motions_is_not_stuck_but_one_that_misse
     rounded = step * np.rint(angle / step)
     assert "stuck" not in causes(changed(others, position=column(POSITION, 2, lambda _: rounded)))
     if step > 1e-3:  # of which slow motion repeats many values
+        k = np.clip(np.arange(len(t)) - 300, 0, None)  # after a breakaway from stiction, 2, 8, 18 ... steps
+        leaps = step * np.where(k < 10, 2 * k**2, 200 + 40 * (k - 10))
+        assert "stuck" not in causes(changed(others, position=column(POSITION, 2, lambda _: leaps)))
         return
     misses = np.where((t > 1.8) & (t < 2.3), rounded[np.searchsorted(t, 1.8)], rounded)
     assert "stuck" in causes(changed(others, position=column(POSITION, 2, lambda _: misses)))

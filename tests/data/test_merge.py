@@ -67,6 +67,13 @@ def test_clocks_without_anything_in_common_are_aligned_by_the_motion() -> None:
     merged = merge_recordings([ROBOT, camera(start=1.7e9 + 3.0)])
     assert merged.points[0].t[0] == pytest.approx(0.0, abs=0.03)
     assert ("do not overlap" in merged.notes[0], merged.points[0].clock_offset_std) == (True, 0.03)
+    # large angles, of which positions are no linear functions
+    far = replace(camera().points[0], position=tip(1.5 * wander(FRAMES, 0)), t=FRAMES + 1e9)
+    wide = replace(ROBOT, joints=replace(ROBOT.joints, position=1.5 * wander(T, 0)))
+    assert merge_recordings([wide, Recording(None, (far,))]).points[0].t[0] == pytest.approx(0.0, abs=0.06)
+    [note] = merge_recordings([ROBOT, camera(start=9.0)], {"camera": -9.3}).notes
+    assert "--clock-offset states. But" in note
+    assert float(note.partition("--clock-offset camera=")[2].rstrip(")")) == pytest.approx(-9.0, abs=0.03)
     # both since 1970: one clock, counted from its first sample
     both = merge_recordings([replace(ROBOT, joints=replace(ROBOT.joints, t=T + 1.7e9)), camera(start=1.7e9)])
     assert (both.joints.t[0], both.points[0].t[0]) == (0.0, 0.0)

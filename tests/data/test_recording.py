@@ -144,7 +144,7 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "scaled pose": (lambda: with_camera(camera_pose=np.diag([2.0, 2.0, 2.0, 1.0])), "not orthonormal"),
     "reflection": (lambda: with_camera(camera_pose=np.diag([1.0, 1.0, -1.0, 1.0])), "reflection"),
     "degrees": (lambda: with_joints(position=Q + 90.0), "'position' reaches 9"),
-    "position_command=deg": (lambda: with_joints(position_command=Q - 90.0), "'position_command' reaches 9"),
+    "--units deg": (lambda: with_joints(position_command=Q - 90.0), "'position_command' reaches 9"),
     "efforts of no robot": (lambda: with_joints(effort=np.full_like(Q, 1e300)), "'effort' reaches 1e\\+300 N m"),
     "speeds of no robot": (lambda: with_joints(velocity=np.full_like(Q, -1e7)), "'velocity' reaches 1e\\+07 rad/s"),
     "a spread of no robot": (lambda: with_joints(effort_std=1e200), "effort_std is 1e\\+200"),
@@ -169,7 +169,7 @@ def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as caught:
         validated_recording(make())
     assert "recording '" in caught.value.where
-    assert case not in ("degrees", "millimetres", "position_command=deg") or case in caught.value.hint
+    assert case not in ("degrees", "millimetres", "--units deg") or case in caught.value.hint
     if case != "NaN effort":
         with pytest.raises(DataError, match=message):
             write_recording(make(), tmp_path / "run.h5")

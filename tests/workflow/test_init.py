@@ -195,6 +195,18 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
         assert f"object held by: {holder} (other frames for --holder: {others})" in capsys.readouterr().out
 
 
+def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path) -> None:
+    link = '<link name="{0}"/><joint name="{0}" type="{1}"><parent link="hub"/><child link="{0}"/>{2}</joint>'
+    more = link.format("finger", "prismatic", '<limit lower="0" upper="0.04" effort="9" velocity="1"/>')
+    more += link.format("hub_tcp", "fixed", "") + "</robot>"
+    (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", more))
+    made = moved(SHORT)
+    for opening, holder, locked in ((np.full(len(SHORT), 0.01), "hub_tcp", {"finger": 0.01}), (SHORT, "finger", {})):
+        position = np.column_stack([made.joints.position, opening])
+        model = proposed(replace(made, joints=JointGroup((*made.joint_names, "finger"), SHORT, position))).model
+        assert (model.object.mount.parent_frame, model.arms.locked_joints) == (holder, locked)
+
+
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
     run = proposed(moved(SHORT, parts=(), effort=True), *beam)

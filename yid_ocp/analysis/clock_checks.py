@@ -255,19 +255,34 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
 
 
 def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
-    """Return issues about drifting clocks and overstated sensor noise, found in the residuals of a fit at `x` (nx,).
+    """Return issues about late and drifting clocks, and overstated sensor noise, found in a fit at `x` (nx,).
 
-    Only an offset that grows during a recording is attributed to the clock. A constant offset of a camera's clock has
-    the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
+    An offset is an issue if it far exceeds the size that the fit expects, or if it grows during a recording. A smaller
+    one has the same effect as missing damping; a diagnosis distinguishes the two (effect `camera_latency`).
     """
     if not evaluation.ok or evaluation.jacobian is None or problem.stated_rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
-    found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
+    found = [*_clocks(problem, x, evaluation), *_overstated(problem, evaluation)]
     return [issue for issue in found if (issue.cause, issue.recording, issue.group) not in known]
 
 
-def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
+def _late(samples: SensorMeasurements, speed: Array, path: Array, recording: str) -> Iterator[Issue]:
+    """Yield an issue if the clock of points with the whitened `speed` is far later or earlier than the fit expects."""
+    if samples.change_by_clock is not None:
+        seen, name = samples.positive_weight_mask, samples.sensor.group_name
+        by_std, left = ((samples.weight * x)[seen] for x in (samples.change_by_clock, path - samples.value))
+        stds, std = float(by_std @ left / (by_std @ by_std + 1)), float(np.linalg.norm(by_std) / np.linalg.norm(speed))
+        size = f"{abs(stds) * std:.2g}"
+        what = f"the fit finds time stamps of {name} {size} s {'late' if stds > 0 else 'early'}, but expects "
+        what += f"{1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
+        advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
+        if (ratio := abs(stds) / _MIN_Z) > 1:
+            line = f"sensors.{name}.clock_offset_std: {size}"
+            yield Issue("clock_offset", what, "warning", ratio, advice, recording, name, "t", setting=line)
+
+
+def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
     for series in channels_with_residual_indices(problem):
@@ -286,6 +301,7 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
             speed = _by_lateness(problem, x, i, samples, result)[samples.positive_weight_mask]
+            yield from _late(samples, speed, result.predicted_outputs[k], episode.recording.name)
             columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:

@@ -183,11 +183,11 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
             and group.clock_offset_std is None
         ):
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
-            late, lag = "late" if lag[0] == "-" else "early", lag.partition(":")[0]
-            what = f"{LATE_POINTS_WORDS}{lag}. Their clock is {late}, or the flexible object lags behind the arm"
-            advice = f"compare points beside the gripper with the angles. If they are not {late}, do nothing. If "
-            advice += "they are, a damping would be wrong. Then import again with --clock-offset "
-            advice += f"{option.rstrip(')')}, or let a fit estimate the offset"
+            what = f"{LATE_POINTS_WORDS}{lag.partition(':')[0]}. Their clock is off, or the flexible object lags behind"
+            advice = (
+                "compare points beside the gripper with the angles. If they are off, too, a damping would be wrong. "
+            )
+            advice += f"Then import again with --clock-offset {option.rstrip(')')}, or let a fit estimate the offset"
             line = f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"
             yield Issue("clock_offset", what, "warning", 1.0, advice, "", group.name, "t", setting=line)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,14 +12,15 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
 from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
-from yid_ocp.data.recording import JointGroup, Recording, validated_recording
+from yid_ocp.data.recording import Recording, validated_recording
 from yid_ocp.errors import DataError, require_known_names
 
 _MIN_SHARED_FRACTION = 0.5  # overlap over the shorter recording; clocks with less are unrelated
-_MIN_EXPLAINED = 0.9  # explained fraction of point motion required to align two clocks
+_MIN_CONTRAST = 0.6  # log of errors, lags far from the best over best; 2 % of unrelated motions of one arm reach it
+_NEAR_LAGS = 0.6  # lags that slow motions do not distinguish well [s]
 _MAX_LEFT_RATIO = 0.7  # ratio of residuals with and without a lag, below which it is reported
 _MIN_SAID_LAG = 0.02  # [s]
-_LAG_SEARCH = 0.3  # range of lags for a shared clock, and around the lag of speeds [s]
+_MAX_GRID, _MAX_BRIDGED = 20000, 0.1  # samples of the search of lags; gap of points that it bridges [s]
 _MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
 _ALIGNED_CLOCK_STD = 0.03  # of an offset that the motion tells, which an object that swings behind shifts [s]
 _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
@@ -28,6 +29,8 @@ _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 class _MotionLag(NamedTuple):
     lag: float
     explained: float
+    left_ratio: float  # of the errors with and without the lag
+    is_clear: bool
 
 
 def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str, float] | None = None) -> Recording:
@@ -49,6 +52,9 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     for recording in recordings:
         if recording.name in offsets:
             shift, said = offsets[recording.name], "as --clock-offset states"
+            if recording is not lead:
+                late = _late_points(first, _with_times_shifted(recording, shift), recording.name, shift)
+                said += late and f". But {late}"
         else:
             shift, said = (0.0, "") if recording is lead else _shift(first, recording)
             if shift:
@@ -93,32 +99,33 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     for recording in (first, other):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
     said = f"{first.name} and {other.name} are assumed to have one clock, as their times overlap by {overlap:.4g} s"
-    seen, joints = _seen_path(other), first.joints
-    best = at_zero = None
-    if seen is not None and joints is not None and len(joints.t) >= _MIN_SAMPLES:
-        t, path = seen[0] + (0.0 if shared else begin - start), seen[1]
-        period = max(0.005, median_sample_period(joints.t), median_sample_period(t))
-        coarse = _speed_lag(_speed(joints.t, joints.position, period), _speed(t, path, period), period)
-        found = [_motion_lag(joints, t, path, period, around) for around in ((0.0, coarse) if shared else (coarse,))]
-        best = max((one for one in found if one is not None), key=lambda one: one.explained, default=None)
-        at_zero = _motion_lag(joints, t, path, period, 0.0, reach=0.0)
     if shared:
-        if best is None or best.explained < _MIN_EXPLAINED or abs(best.lag) < _MIN_SAID_LAG:
-            return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
-        if at_zero is None or 1 - best.explained < _MAX_LEFT_RATIO * (1 - at_zero.explained):
-            share = f"which explains {best.explained:.0%} of their motion"
-            said += f", so nothing was shifted. But {LATE_POINTS_WORDS}{-best.lag:+.2g} s ({share}): their clock is "
-            said += "off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the "
-            said += f"clock, import again with this option (--clock-offset {other.name}={-best.lag:.2g})"
-        return 0.0, said
-    if best is None or best.explained < _MIN_EXPLAINED:
+        late = _late_points(first, other, other.name, 0.0)
+        if late:
+            return 0.0, f"{said}, so nothing was shifted. But {late}"
+        return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
+    best = _motion_lag(first, other, begin - start)
+    if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
         what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
         hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
+        hint += f", or {other.name}={begin - start - best.lag:.4f}, the likeliest by the motion" if best else ""
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "because the recording times do not overlap. With this shift, the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion). A fit of the model corrects its error (± {_ALIGNED_CLOCK_STD:g} s)"
     return begin - start - best.lag, why
+
+
+def _late_points(first: Recording, other: Recording, name: str, applied: float) -> str:
+    """What is said if the points of `other` clearly follow the joints of `first` better with another shift."""
+    best = _motion_lag(first, other)
+    if best is None or not best.is_clear or best.left_ratio > _MAX_LEFT_RATIO or abs(best.lag) < _MIN_SAID_LAG:
+        return ""
+    said = f"{LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): their clock "
+    said += (
+        "is off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the clock, "
+    )
+    return f"{said}import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
 
 
 def _check_time_unit(recording: Recording, duration: float, default: str) -> None:
@@ -132,24 +139,45 @@ def _check_time_unit(recording: Recording, duration: float, default: str) -> Non
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 
-def _motion_lag(
-    joints: JointGroup, t: Array, path: Array, period: float, around: float, reach: float = _LAG_SEARCH
-) -> _MotionLag | None:
-    """Lag within `reach` of `around` [s] at which angles explain positions best (linearly); None for few samples."""
-    moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
-    lags = around + period * np.arange(-round(reach / period), round(reach / period) + 1)
-    inside = (t - lags[-1] > joints.t[0]) & (t - lags[0] < joints.t[-1])
-    if not moving.shape[1] or inside.sum() < max(_MIN_SAMPLES, 5 * moving.shape[1]):
+def _motion_lag(first: Recording, other: Recording, shift: float = 0.0) -> _MotionLag | None:
+    """How late the points of `other`, shifted by `shift` [s], follow the joints of `first`; None for too little motion.
+
+    At every lag with enough common time, linear functions of the angles are fitted to the positions.
+    """
+    from scipy import signal  # slow to import
+
+    seen_path, joints = _seen_path(other), first.joints
+    if seen_path is None or joints is None or len(joints.t) < _MIN_SAMPLES:
         return None
-    t, path = t[inside], path[inside] - path[inside].mean(axis=0)
-    explained = []
-    for lag in lags:
-        q = np.stack([np.interp(t - lag, joints.t, column) for column in moving.T], axis=1)
-        q -= q.mean(axis=0)
-        left = path - q @ np.linalg.lstsq(q, path, rcond=1e-9)[0]
-        explained.append(1.0 - float(np.sum(left**2) / np.sum(path**2)))
-    best = int(np.argmax(explained))
-    return _MotionLag(float(lags[best]), explained[best])
+    t, path = seen_path[0] + shift, seen_path[1]
+    sums = partial(signal.correlate, method="fft")  # over the common samples, for every lag of the first argument
+    moving = joints.position[:, np.ptp(joints.position, axis=0) > _MIN_TURN]
+    spans = joints.t[-1] - joints.t[0], t[-1] - t[0]
+    period = max(0.005, median_sample_period(joints.t), median_sample_period(t), max(spans) / _MAX_GRID)
+    grid, even = np.arange(joints.t[0], joints.t[-1], period), np.arange(t[0], t[-1], period)
+    if not moving.shape[1] or min(len(grid), len(even)) < max(_MIN_SAMPLES, 5 * moving.shape[1]):
+        return None
+    later = np.minimum(np.searchsorted(t, even), len(t) - 1)
+    seen = (t[later] - t[np.maximum(later - 1, 0)] < _MAX_BRIDGED).astype(float)
+    x = np.stack([np.interp(grid, joints.t, column) for column in (moving - moving.mean(axis=0)).T])
+    y = seen * np.stack([np.interp(even, t, column) for column in (path - path.mean(axis=0)).T])
+    whole = np.ones(len(grid))
+    n = np.maximum(np.rint(sums(seen, whole)), 1.0)
+    sum_x, sum_y = np.array([sums(seen, a) for a in x]), np.array([sums(b, whole) for b in y])
+    xx = np.array([[sums(seen, a * b) for b in x] for a in x]) - sum_x[:, None] * sum_x / n
+    xy = np.array([[sums(b, a) for b in y] for a in x]) - sum_x[:, None] * sum_y / n
+    yy = sums(np.sum(y**2, axis=0), whole) - np.sum(sum_y**2, axis=0) / n
+    used = n >= _MIN_SHARED_FRACTION * min(len(grid), seen.sum())
+    lags = (signal.correlation_lags(len(even), len(grid)) * period + (even[0] - grid[0]))[used]
+    xx, xy, n, yy = np.moveaxis(xx, 2, 0)[used], np.moveaxis(xy, 2, 0)[used], n[used], yy[used]
+    gained = np.sum(xy * (np.linalg.pinv(xx, rcond=1e-6, hermitian=True) @ xy), axis=(1, 2))
+    explained = np.clip(gained / np.maximum(yy, 1e-12), 0.0, 1.0 - 1e-9)
+    support = -np.log1p(-explained) * n
+    best = int(np.argmax(support))
+    far = np.max(support, where=np.abs(lags - lags[best]) > _NEAR_LAGS, initial=0.0)
+    left = (1 - explained[best]) / (1 - explained[np.argmin(np.abs(lags))])
+    is_clear = bool(support[best] - far >= _MIN_CONTRAST * n[best])
+    return _MotionLag(float(lags[best]), float(explained[best]), float(left), is_clear)
 
 
 def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
@@ -161,35 +189,6 @@ def _seen_path(recording: Recording) -> tuple[Array, Array] | None:
         if whole.shape[1] and rows.sum() >= _MIN_SAMPLES and np.ptp(whole[rows], axis=0).max() > _MIN_TRAVEL:
             return group.t[rows], whole[rows]
     return None
-
-
-def _speed_lag(a: tuple[Array, float], b: tuple[Array, float], period: float) -> float:
-    """Delay [s] of the speed `b` relative to the speed `a`. Each has samples every `period`, and their first time."""
-    from scipy import signal  # slow to import
-
-    (x, x_start), (y, y_start) = a, b
-    if not (len(x) and len(y)):  # shorter than a period of the other
-        return 0.0
-    lags = signal.correlation_lags(len(y), len(x))
-    ones_x, ones_y = np.ones(len(x)), np.ones(len(y))
-    count, sum_x, sum_y, sum_xx, sum_yy, sum_xy = (
-        signal.correlate(second, first, method="fft")
-        for first, second in ((ones_x, ones_y), (x, ones_y), (ones_x, y), (x * x, ones_y), (ones_x, y * y), (x, y))
-    )
-    n = np.maximum(np.rint(count), 1.0)
-    spread = np.sqrt(np.maximum((sum_xx - sum_x**2 / n) * (sum_yy - sum_y**2 / n), 1e-12))
-    enough = n >= _MIN_SHARED_FRACTION * min(len(x), len(y))
-    correlation = np.where(enough, (sum_xy - sum_x * sum_y / n) / spread, -math.inf)
-    return float(lags[int(np.argmax(correlation))] * period + (y_start - x_start))
-
-
-def _speed(t: Array, values: Array, period: float) -> tuple[Array, float]:
-    """Norm of the columns' rates every `period` [s], from values averaged over 50 ms, and the first sample's time."""
-    even = np.arange(t[0], t[-1], period)
-    path = np.stack([np.interp(even, t, column) for column in values.T], axis=1)
-    width = max(1, round(0.05 / period))
-    path = np.apply_along_axis(np.convolve, 0, path, np.ones(width) / width, "valid")
-    return np.linalg.norm(np.diff(path, axis=0), axis=1) / period, float(t[0] + 0.5 * width * period)
 
 
 def _with_times_shifted(recording: Recording, shift: float) -> Recording:

@@ -422,8 +422,8 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         unit, size = JOINT_CHANNEL_UNITS[channel], np.nan_to_num(np.abs(value))
         row, column = divmod(int(size.argmax()), len(joints.names))
         what = f"'{channel}' reaches {size.max():g} {unit} (joint '{joints.names[column]}', {joints.t[row]:g} s)"
-        hint = f"{'if it is in degrees' if unit == 'rad' else 'check its unit'}, import the original data again "
-        hint += f"and add {channel}={'deg' if unit == 'rad' else 'UNIT'} to --units"
+        cause, units = ("if angles are in degrees", "deg") if unit == "rad" else ("check its unit", f"{channel}=UNIT")
+        hint = f"{cause}, import the original data again with --units {units}"
         raise_data_error_unless(size.max() <= _LARGEST[unit], what, place, f"at most {_LARGEST[unit]:g} {unit}", hint)
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()

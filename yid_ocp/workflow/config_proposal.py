@@ -85,6 +85,7 @@ class ProposedConfigChoices:
     joints: tuple[str, ...]  # recorded joints that move the object, in the URDF's order
     unused_joints: tuple[str, ...]  # recorded joints that the model does not need or know
     unrecorded_joints: tuple[str, ...]  # movable joints of the URDF that are not recorded
+    locked_joints: Mapping[str, float]  # position of the fingers of a gripper, which rest [rad or m]
     arms: tuple[_ArmChain, ...]  # arms that hold the object; the first one carries its root
     holder_frame: str  # carries the object's root
     grasps: Mapping[str, str]  # point of the object by the frame that holds it
@@ -141,7 +142,8 @@ def propose_config_choices(
     whole, first = read_urdf(robot), recordings[0]
     recorded, known = first.joints, _recorded_urdf_joints(robot, whole, recordings)
     assert recorded is not None
-    tree = read_urdf(robot, joints=known)
+    locked = _resting_fingers(read_urdf(robot, joints=known), recorded, recordings)
+    tree = read_urdf(robot, joints=[name for name in known if name not in locked], locked=locked)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))
     if holder is None and not branches:  # a payload is on the frame most similar to a tool
         holder = min(reversed([name for name, at in tree.frames.items() if at.joint_index >= 0]), key=_tool_rank)
@@ -168,6 +170,7 @@ def propose_config_choices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
         tuple(name for name in whole.joint_names if name not in recorded.names),
+        locked,
         tuple(arm for arm in arms if set(arm.joints) & set(joints)) or arms,
         holder,
         held,
@@ -229,6 +232,21 @@ def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
             ends = [name for name in own if tree.frames[name].proximal_names.issuperset({*own} - {name})]
             own = [*ends, *(name for name in own if name not in ends)] if len(ends) == 1 else own
             yield _ArmChain(tuple(tree.joint_names[i] for i in tree.ancestor_joint_indices(j)), tuple(own))
+
+
+def _resting_fingers(tree: Mechanism, recorded: JointGroup, recordings: Sequence[Recording]) -> dict[str, float]:
+    """Median positions of end joints that rest in all recordings, and before which a frame is more like a tool."""
+
+    def rank(joint: str) -> int:
+        return min(_tool_rank(name)[0] for name, at in tree.frames.items() if at.joint_index == tree.joint_index(joint))
+
+    return {
+        name: round(float(np.median(recorded.position[:, recorded.names.index(name)])), 4)
+        for *before, name in (arm.joints for arm in _arms(tree))
+        if before
+        and rank(before[-1]) < rank(name)
+        and max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL
+    }
 
 
 def _tool_rank(frame: str) -> tuple[int, bool]:
@@ -506,10 +524,8 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
 
 def _time_step(period: float) -> float:
     """Return a time step [s] of at most `_MAX_TIME_STEP`: whole sample periods or, for slow clocks, a part of one."""
-    if period <= _MAX_TIME_STEP:
-        step = period * max(1, math.floor(_MAX_TIME_STEP / period + 1e-3))
-    else:
-        step = period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
+    whole = math.floor(_MAX_TIME_STEP / period + 1e-3)
+    step = period * whole if whole else period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
     return float(f"{step:.3g}")
 
 
