@@ -146,6 +146,7 @@ def test_a_gap_without_a_cause_is_refitted_with_half_the_time_step(monkeypatch):
     seen.evidence.screening.largest_predicted_chi2_decrease, seen.search.thresholds.min_log_bayes_factor = 50.0, 5.0
     monkeypatch.setattr(diagnose, "_fall_at_half_time_step", lambda *given: asked.append(given[-1]) or 26.0)
     monkeypatch.setattr(diagnose, "_at_half_time_step", lambda *_: "finer")
-    for verdict, found in (("unknown", "finer"), ("no_gap", seen)):
+    for verdict, step, found in (("unknown", 0.005, "finer"), ("no_gap", 0.005, seen), ("unknown", 0.002, seen)):
+        seen.nominal.problem.step.time_step = step
         assert diagnose._examined_anew(seen, Mock(selected_effects=(), verdict=verdict)) == found
     assert asked == [True]

@@ -48,7 +48,7 @@ from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 _LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
-_MAX_STEP_OF_LAST_HALVING = 2.5e-3  # step from which on a failure of the model with all candidates is final [s]
+_LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -149,7 +149,7 @@ def _examined(
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
-        if not own.step.time_step > _MAX_STEP_OF_LAST_HALVING:
+        if not own.step.time_step > _LONGEST_FINAL_TIME_STEP:
             raise
         return _at_half_time_step(seen, "the model with all candidates fails", 0.0)
     search.record_stage_end_time("screening")
@@ -167,8 +167,9 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
     """
     if seen.is_corrected_for_links:
         return seen
-    fall = _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
+    is_final = fit.problem.step.time_step <= _LONGEST_FINAL_TIME_STEP
+    fall = 0.0 if is_final else _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
     if fall > least:
         return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
     return seen if is_refitted else _without_error_of_links(seen, fit, least)
