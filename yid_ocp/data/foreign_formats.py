@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,28 +20,12 @@ AXES = ("x", "y", "z")
 ColumnMeaning = tuple[str, str] | None
 """Meaning of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None if it is omitted."""
 _EXACT_PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
-_TIME_WORDS = "t time times timestamp timestamps time_stamp stamp header_stamp sec secs seconds elapsed elapsed_time"
-_CHANNEL_WORDS: Mapping[str, str] = {
-    "position": "q pos position positions angle angles joint_pos joint_position joint_positions actual_q q_actual",
-    "velocity": "dq qd vel velocity velocities speed joint_vel joint_velocity joint_velocities actual_qd dq_actual",
-    "effort": "tau eff effort efforts torque torques trq joint_effort joint_torque joint_torques tau_J tau_measured",
-    "external_effort": "tau_ext ext_tau external_torque external_effort tau_ext_hat_filtered",
-    "position_command": "cmd q_cmd q_des q_d q_ref pos_cmd cmd_pos position_command target_q desired_position",
-    "velocity_command": "dq_cmd dq_des dq_d qd_d vel_cmd cmd_vel velocity_command target_qd desired_velocity",
-    "torque_enable": "torque_enable",
-}
-"""Words for each joint channel in column names of common tools. Case counts in `tau_J`: `tau_j1` is of a joint `j1`."""
-_CHANNEL_BY_WORD = {word: channel for channel, words in _CHANNEL_WORDS.items() for word in words.split()}
+# words of column names of common tools; case counts in `tau_J`: `tau_j1` is of a joint `j1`
+_WORDS = json.loads((Path(__file__).parent / "defaults" / "header_words.json").read_text("utf-8"))
+_CHANNEL_BY_WORD = {word: channel for channel, words in _WORDS["channels"].items() for word in words}
 _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
-UNIT_BY_WORD = {
-    **dict.fromkeys(("s", "sec", "secs", "seconds", "second"), "s"),
-    **{word: word for word in ("ms", "us", "ns", "m", "cm", "mm", "rad", "deg", "rev", "rpm", "rad/s", "deg/s")},
-    **{"degrees": "deg", "radians": "rad", "deg/sec": "deg/s", "rad_s": "rad/s", "deg_s": "deg/s", "rad/sec": "rad/s"},
-    **{"°": "deg", "°/s": "deg/s", "µs": "us", "μs": "us"},
-    **dict.fromkeys(("nm", "n m", "n*m", "n.m", "n·m", "n_m"), "N m"),
-    **{"nmm": "N mm", "n mm": "N mm", "n*mm": "N mm", "mnm": "mN m", "mn m": "mN m"},
-}
+UNIT_BY_WORD: Mapping[str, str] = {word: unit for unit, words in _WORDS["units"].items() for word in words}
 """Units in the spellings of headers, in lower case."""
 _NUMBERED_COMMAND = re.compile(r"q_(d|des|ref|cmd)_\d+")  # of a joint without a name
 _NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
@@ -85,7 +71,7 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
 
 def _exact_meaning(column: str, sensor_components: Sequence[str]) -> ColumnMeaning:
     """Meaning in this package's own spelling, in which joints, points and sensors keep their names."""
-    if column.lower() in _TIME_WORDS.split():
+    if column.lower() in _WORDS["time"]:
         return "t", ""
     for prefix in sorted(_EXACT_PREFIXES, key=len, reverse=True):
         if column.startswith(prefix) and column != prefix:
@@ -101,7 +87,7 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> ColumnMeani
 def _spelled_meaning(column: str) -> ColumnMeaning:
     """Meaning in the spelling of other tools: `pos_elbow`, `elbow.vel`, `tau_J[0]`, `/joint_states/elbow/effort`."""
     plain = re.sub(r"[\s./:\-\[\]%]+", "_", column).strip("_")
-    if plain.lower() in _TIME_WORDS.split() or plain.lower() in ("field_header_stamp", "header_stamp_sec"):
+    if plain.lower() in _WORDS["time"] or plain.lower() in ("field_header_stamp", "header_stamp_sec"):
         return "t", ""
     if axis := re.fullmatch(r"(.+?)_([xyzXYZ])", plain):
         return None if _NO_POINT.fullmatch(axis[1]) else (axis[2].lower(), axis[1])
