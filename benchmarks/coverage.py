@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
+from baxter import baxter_foam_y_system
 from make_recordings import OFFSETS, SNAP, TRUTH, within_limits
 
 import yid_ocp
@@ -40,12 +41,7 @@ from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.version import sha256_of_folder_sources
-from yid_ocp.virtual.experiment import (
-    ArmSensorNoise,
-    VirtualExperimentSettings,
-    baxter_foam_y_system,
-    run_virtual_experiment,
-)
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import (
     MultisineMotion,
     MultisineOptions,

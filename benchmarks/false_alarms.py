@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from baxter import baxter_foam_y_system
 from coverage import (
     CONFIGS,
     DURATION,
@@ -43,7 +44,7 @@ from yid_ocp.files import json_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import sha256_of_folder_sources
-from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, baxter_foam_y_system
+from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions

@@ -26,6 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from baxter import baxter_foam_y_system
 from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 from planning import PlannedMovement
@@ -42,12 +43,7 @@ from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
-from yid_ocp.virtual.experiment import (
-    PointCamera,
-    VirtualExperimentSettings,
-    baxter_foam_y_system,
-    run_virtual_experiment,
-)
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_step

@@ -19,17 +19,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from baxter import baxter_foam_y_system
 
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.files import atomic_write
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import (
-    ArmSensorNoise,
-    PointCamera,
-    VirtualExperimentSettings,
-    baxter_foam_y_system,
-    run_virtual_experiment,
-)
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult
 

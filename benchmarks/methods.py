@@ -10,6 +10,7 @@ import json
 import sys
 from pathlib import Path
 
+from baxter import baxter_foam_y_system
 from rich.console import Console
 from rich.table import Table
 from workloads import CLEAN, STIFFNESSES, TIME_STEP
@@ -19,7 +20,6 @@ from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
 

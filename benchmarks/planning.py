@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from baxter import baxter_foam_y_system
 from make_recordings import ROUGH, TRUTH
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -41,7 +42,7 @@ from yid_ocp.planning.joint_paths import (
     solve_start_equilibrium,
 )
 from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, baxter_foam_y_system
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from baxter import baxter_foam_y_system
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -26,7 +27,6 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
 

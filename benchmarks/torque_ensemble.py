@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from baxter import baxter_foam_y_system
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
@@ -37,12 +38,7 @@ from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, VERDICT
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import sha256_of_folder_sources
-from yid_ocp.virtual.experiment import (
-    PointCamera,
-    VirtualExperimentSettings,
-    baxter_foam_y_system,
-    run_virtual_experiment,
-)
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {

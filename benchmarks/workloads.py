@@ -16,6 +16,7 @@ from unittest import mock
 
 import numpy as np
 import pinocchio as pin
+from baxter import baxter_foam_y_system
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
@@ -30,7 +31,6 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 Array = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ import hypothesis
 import numpy as np
 import pytest
 import threadpoolctl
+from baxter import baxter_foam_y_system
 from pendulum_run import carried_out as carried_out
 from pendulum_run import cli as cli
 from pendulum_run import left_nothing as left_nothing
@@ -34,7 +35,6 @@ from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 diagnose_module = importlib.import_module("yid_ocp.diagnosis.diagnose")  # the function hides its module
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from baxter import baxter_foam_y_system
 from small_problems import joints, measured, pendulum_step, points, recording, seen
 
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals, point_clock_offset_drift_and_rms_error
@@ -39,7 +40,6 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.workflow.build_problem import build_problem
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from baxter import baxter_foam_y_system
 from heard import Heard
 
 from yid_ocp.analysis import experiment_design
@@ -18,7 +19,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, fit_problem
-from yid_ocp.virtual.experiment import VirtualExperimentSettings, baxter_foam_y_system, run_virtual_experiment
+from yid_ocp.virtual.experiment import VirtualExperimentSettings, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build_problem import load_problem

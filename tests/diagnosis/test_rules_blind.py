@@ -11,6 +11,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from baxter import baxter_foam_y_system
 from factories import amplitude, cases, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -19,7 +20,6 @@ from yid_ocp.diagnosis.blind import BlindCaseGenerator, PlannedBlindCase, Synthe
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_FORCE_BUILDERS, InjectedEffect
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 

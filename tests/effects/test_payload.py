@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from baxter import baxter_foam_y_system
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.effects.base import effort_limit_ratio_to_baxter, frame_names_at_arm_link_ends, one_frame_name_per_arm_link
@@ -22,7 +23,6 @@ from yid_ocp.model.mechanism import (
     rotation_from_rpy,
 )
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 TURNED = homogeneous_transform(rotation_from_rpy(0.3, -0.5, 1.1), [0.02, 0.1, 0.25])
 

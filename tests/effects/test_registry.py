@@ -6,6 +6,7 @@ import math
 import re
 
 import pytest
+from baxter import baxter_foam_y_system
 
 from yid_ocp.effects import EFFECTS, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects import base as places
@@ -14,7 +15,6 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import FlexibleSegment, System, flexible_object
 from yid_ocp.model.servos_and_springs import MotorKindAndPreset, ServoModelOptions
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 
 @pytest.fixture(scope="module")

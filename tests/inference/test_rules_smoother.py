@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import threadpoolctl
+from baxter import baxter_foam_y_system
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -23,7 +24,6 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, fit_problem
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 SOURCES = tuple(SmoothedUnknownGroup(*told) for told in (("T1", "force"), ("T2", "force"), ("camera", "bias")))
 FORCE, OTHER_FORCE, BIAS = SOURCES

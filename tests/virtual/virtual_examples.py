@@ -1,8 +1,7 @@
 """Systems and values that the tests of this folder share."""
 
 import pytest
-
-from yid_ocp.virtual.experiment import baxter_foam_y_system
+from baxter import baxter_foam_y_system
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install '.[blind]'")
 

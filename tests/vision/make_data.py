@@ -9,11 +9,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+from baxter import baxter_foam_y_system
 
 from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision.fit import ShapeFitter

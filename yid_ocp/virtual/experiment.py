@@ -16,10 +16,8 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.effects.base import joint_names_by_arm
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX
-from yid_ocp.model.system import Grasp, System
-from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.virtual import joint_motion
 from yid_ocp.virtual.mjcf import CasadiEvaluator, import_mujoco
@@ -37,21 +35,6 @@ _Generators = Mapping[str, np.random.Generator]
 _RANDOM_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias", "clock")
 _CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # direction from the object to the camera
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
-
-
-def baxter_foam_y_system(arms: int) -> System:
-    """Build the system of Caldwell (ISER 2014), in which one or two arms of Baxter hold the foam Y by point grasps.
-
-    The left arm holds the tip of T2 (43 coordinates), the right arm the tip of T3 (50). Every arm joint is driven, and
-    every coordinate has a viscous damping of 0.05 N m s/rad. Raises `ConfigError` for another number of arms.
-    """
-    if arms not in (1, 2):
-        raise ConfigError(f"there is no system with {arms} arms", where="arms", allowed="1 or 2", hint="pass arms=1")
-    sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in joint_motion.BAXTER_JOINT_NAMES_WITHOUT_SIDE]
-    robot = read_urdf("package:baxter", joints=names)
-    grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
-    return System.build(robot, objects=[(foam_y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
 
 
 @dataclass(frozen=True)
