@@ -11,7 +11,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from baxter import baxter_foam_y_system
 from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 import yid_ocp

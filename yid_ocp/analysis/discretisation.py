@@ -137,8 +137,7 @@ def predicted_refit_residual_at_finer_step(
 
     `fine` is the problem with the shorter time step. One Gauss-Newton step is made from the coarse fit `x` (nx,), where
     `at_x` is the coarse evaluation with Jacobian. With process noise, the coarse weights are used. Without it, `fine`
-    is fitted with `is_refitted`, or if the shorter step changes predictions by more than the residual, too much for one
-    linear step.
+    is fitted with `is_refitted`, or if the shorter step changes predictions by more than the residual.
     """
     refined = _FinerModel(fine)
     made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)

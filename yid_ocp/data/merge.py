@@ -122,10 +122,8 @@ def _late_points(first: Recording, other: Recording, name: str, applied: float) 
     if best is None or not best.is_clear or best.left_ratio > _MAX_LEFT_RATIO or abs(best.lag) < _MIN_SAID_LAG:
         return ""
     said = f"{LATE_POINTS_WORDS}{-best.lag:+.2g} s (which explains {best.explained:.0%} of their motion): their clock "
-    said += (
-        "is off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the clock, "
-    )
-    return f"{said}import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
+    said += "is off, or the flexible object lags behind the arm. `yid-ocp check` says how to decide. If it is the "
+    return f"{said}clock, import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
 
 
 def _check_time_unit(recording: Recording, duration: float, default: str) -> None:

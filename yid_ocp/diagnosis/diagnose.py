@@ -163,14 +163,13 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
     """The nominal model, examined again at half the time step or without the error of the links.
 
     `seen` if neither lowers r'r of a fit significantly and by half of a candidate's fall (`gap`), or after the links.
-    With `is_refitted`, only half the time step is tried, by a refit: a fit with long steps may lie in a wrong minimum.
+    `is_refitted`: only half the step is tried, by a refit, since a fit with long steps may lie in a wrong minimum.
     """
     if seen.is_corrected_for_links:
         return seen
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
-    is_final = fit.problem.step.time_step <= _LONGEST_FINAL_TIME_STEP
-    fall = 0.0 if is_final else _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
-    if fall > least:
+    is_long, how = fit.problem.step.time_step > _LONGEST_FINAL_TIME_STEP, (fit, seen.events, is_refitted)
+    if is_long and (fall := _fall_at_half_time_step(seen.search, *how)) > least:
         return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
     return seen if is_refitted else _without_error_of_links(seen, fit, least)
 

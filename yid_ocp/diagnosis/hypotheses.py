@@ -218,10 +218,9 @@ class AllCandidatesProblem:
 
     def with_half_time_step(self) -> AllCandidatesProblem:
         """Return the problem with half the time step and untruncated recordings, whitened by sensor noise alone."""
-        made = self.estimated_at_half_time_step
+        made, held = self.estimated_at_half_time_step, self.problem.with_episodes(self.problem.held_out, ())
         if not self.is_split_in_blocks:
-            held = self.problem.with_episodes(self.problem.held_out, ()).with_time_step(made.step.time_step)
-            made = made.with_episodes(made.episodes, held.episodes)
+            made = made.with_episodes(made.episodes, held.with_time_step(made.step.time_step).episodes)
         return replace(self, problem=made, held_out_spread=None)
 
     def with_smoothed_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:

@@ -69,8 +69,7 @@ def step_mean_inputs(
     the derivative of a spline through the integral, which preserves every mean. Efforts of kind `command` and held
     commands of servos are piecewise constant, with up to five lost samples in a row interpolated. Each input acts later
     than recorded by `delay` (nu,) [s]. With `servos` (of all driven joints) the input is the position command, or
-    `MOTOR_OFF_COMMAND`. `where` is the name of the recording. Raises `DataError` if a joint is missing or efforts
-    (`servos`: commands) are not recorded.
+    `MOTOR_OFF_COMMAND`. `where` names the recording. Raises `DataError` without a joint or efforts (commands).
     """
     if not driven:
         return np.zeros((grid.steps, 0))
@@ -153,8 +152,8 @@ def _courses(
             allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
             hint = "import commands (bag: --command-topic TOPIC), or let measured angles move the arm: mode: prescribed"
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
-        commands = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)]
-        times, rows = _with_lost_samples(t, commands)
+        own = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)]
+        times, rows = _with_lost_samples(t, own)
 
         def command(row: Array, name: str) -> scipy.interpolate.PPoly:
             if servos[name].command_interpolation == "held":

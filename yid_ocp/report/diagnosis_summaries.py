@@ -40,14 +40,6 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
-_BLIND_CATEGORY_TEXTS = {
-    "null": "without an effect",
-    "single": "with one effect",
-    "pair": "with two effects",
-    "outside": "with a cause that the diagnosis does not know",
-    "left_out": "with an effect that was removed from its candidates",
-    "finer_chain": "with more links than the model (no answer counts)",
-}
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -146,24 +138,17 @@ def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _blind_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on cases, right answers, false alarms, overlooked effects and probabilities of a blind test."""
-    count, kinds = len(result["marks"]), Counter(entry["category"] for entry in result["marks"])
-    parts = ", ".join(f"{kinds[kind]} {words}" for kind, words in _BLIND_CATEGORY_TEXTS.items() if kinds[kind])
-    yield f"The blind test has {count} synthetic cases (seed {result['seed']}): {parts or 'none'}."
-    hours = (result["seconds"] or 0.0) * _MIN_CONCLUSIVE_CASES / 3600
+    count = len(result["marks"])
+    yield f"The blind test has {count} synthetic cases (seed {result['seed']})."
     text = "Draw no conclusion from so few cases: the 95 % intervals below are wide. Repeat the command with --cases "
-    text += f"{_MIN_CONCLUSIVE_CASES} and another --out (about {hours:.1f} h on one processor)."
+    text += f"{_MIN_CONCLUSIVE_CASES} and another --out."
     yield text if 0 < count < _MIN_CONCLUSIVE_CASES else ""
     right, of = (sum(own["right"][key] for own in result["experiments"].values()) for key in ("count", "of"))
-    alarms, seen, first = (result["intervals"][key] for key in ("false_alarms", "detected", "kind_first"))
+    alarms, seen = (result["intervals"][key] for key in ("false_alarms", "detected"))
     yield f"{right} of {of} cases with a hidden cause were answered right." if of else ""
     yield f"{alarms['count']} of {alarms['of']} cases without an effect had a false alarm." if alarms["of"] else ""
     missed = f"{seen['of'] - seen['count']} of {seen['of']} cases with one effect were overlooked: no gap was reported."
     yield missed if seen["of"] else ""
-    yield (
-        f"In {first['count']} of the other {first['of']}, the first candidate is the true effect."
-        if first["of"]
-        else ""
-    )
     stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
     if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)

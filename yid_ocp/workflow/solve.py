@@ -24,8 +24,6 @@ from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
-_BARS, _SPARKLINE_WIDTH = "▁▂▃▄▅▆▇█", 24
-
 
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS, is_live: bool = False
@@ -98,24 +96,17 @@ def _iterate_logger(
 
 
 def _iterate_table(problem: EstimationProblem, iterates: Sequence[Iterate]) -> list[Sequence[str]]:
-    """Return table rows of cost and parameters (start, now, last step, course), largest relative steps first."""
+    """Return table rows of cost and parameters (start, now, last step), largest relative steps first."""
     courses = {name: [float(entry.x[i]) for entry in iterates] for i, name in enumerate(problem.shared_parameters)}
     steps = {name: own[-1] - own[-2] if len(own) > 1 else 0.0 for name, own in courses.items()}
     ordered = sorted(courses, key=lambda name: -abs(steps[name]) / max(abs(courses[name][-1]), 1e-12))
     costs = [entry.cost for entry in iterates]
     last = costs[-1] - costs[-2] if len(costs) > 1 else 0.0
     rows = [("cost", "", costs, last), *((n, problem.system.parameters[n].unit, courses[n], steps[n]) for n in ordered)]
-    table: list[Sequence[str]] = [("moves most first", "start", "now", "last step", "unit", "course")]
+    table: list[Sequence[str]] = [("moves most first", "start", "now", "last step", "unit")]
     for name, unit, own, step in rows:
-        table.append((name, f"{own[0]:.5g}", f"{own[-1]:.5g}", f"{step:+.2g}", unit, _sparkline(own)))
+        table.append((name, f"{own[0]:.5g}", f"{own[-1]:.5g}", f"{step:+.2g}", unit))
     return table
-
-
-def _sparkline(values: Sequence[float]) -> str:
-    """Return the last values as a text of bars between their minimum and maximum."""
-    shown = values[-_SPARKLINE_WIDTH:]
-    low, high = min(shown), max(shown)
-    return "".join(_BARS[round((len(_BARS) - 1) * (value - low) / ((high - low) or 1.0))] for value in shown)
 
 
 def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
