@@ -137,9 +137,7 @@ def test_what_is_left_out_is_said_once(tmp_path: Path, caplog: pytest.LogCapture
     assert read_urdf(file, joints=["joint1", "joint2"]).joint_names == ("joint1", "joint2")
     file.write_text(MODELS["rail with references"])
     read_urdf(file)
-    assert (
-        "leaves out springs of joints (1 in the file). To add them to efforts, set model.joint_springs" in caplog.text
-    )
+    assert "springs of joints (1 in the file). To add them to efforts, set model.joint_springs" in caplog.text
 
 
 GRIPPER = """<body name="gripper" {at}>{free}<site name="palm" pos="0 0.02 0.01"/>

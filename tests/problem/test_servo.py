@@ -134,8 +134,7 @@ def test_a_servo_far_stiffer_than_the_step_is_stable(step) -> None:
 def test_commands_are_held_or_interpolated_and_late_and_may_be_lost(urdf_folder, commands, expected) -> None:
     system = servo_step(urdf_folder, commands=commands).system
     t = np.array([0.0, 0.1, 0.2, 0.4])
-    command = np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
-    group = joints(PENDULUM, t, np.zeros((4, 2)), position_command=command)
+    group = joints(PENDULUM, t, np.zeros((4, 2)), position_command=np.outer([1.0, 3.0, 2.0, 4.0], [1.0, 0.0]))
     found = step_mean_inputs(group, PENDULUM, TimeGrid(0.0, 0.1, 4), "run", servos=system.servos)
     np.testing.assert_allclose(found[:, 0], expected)
     late = step_mean_inputs(group, PENDULUM, TimeGrid(0.1, 0.1, 3), "run", np.array([0.1, 0.0]), system.servos)
