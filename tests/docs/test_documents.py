@@ -86,12 +86,12 @@ def test_names_in_the_pages_exist(repository):
     """What stands in backticks with an underscore is a name of the code, of a setting or of a file."""
     # attributes of a group are its quantity and an ending, and one page makes an effect of its own
     known = {"current_bias_std", "joint_churning", *(file.stem for file in repository.glob("docs/**/*"))}
-    for pattern in ("yid_ocp/**/*.py", "yid_ocp/**/*.html", "configs/*.yaml", "benchmarks/**/*.py", "tests/**/*.py"):
+    code = ("yid_ocp/**/*.py", "yid_ocp/**/*.html", "benchmarks/**/*.py", "tests/**/*.py")
+    for pattern in (*code, "configs/*.yaml", "yid_ocp/**/*.json"):
         for file in repository.glob(pattern):
             known |= {file.stem, *re.findall(r"\w+", file.read_text(encoding="utf-8"))}
-    pages = [*repository.glob("*.md"), *repository.glob("docs/**/*.md")]
     absent = {}
-    for file in pages:
+    for file in (*repository.glob("*.md"), *repository.glob("docs/**/*.md")):
         if file.name != "CHANGELOG.md":
             text = re.sub(r"```.*?```", "", file.read_text(encoding="utf-8"), flags=re.DOTALL)
             spans = re.findall(r"`([^`]+)`", text)
