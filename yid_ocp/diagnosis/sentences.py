@@ -48,7 +48,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         )
         if told := [text for several, text in advice if len(several) > 1]:
             return f"{told[0]} This can separate these effects: {', '.join([effect.label for effect in rivals])}."
-    place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in _IMMOVABLE_LOCATIONS]
+    still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
+    place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in still]
     mostly = _listed("Record slow and fast motions, with pauses, and most motion at ", place, " (where the gap is).")
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
@@ -76,7 +77,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += [*_bound_by_priors(result), *_earlier_runs(result)]
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
     divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
-    links = "The diagnosis subtracted the error from too few links. For other commands, set "
+    links = "The model has too few links. The resulting error is not part of these numbers. For other commands, set "
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     text += [f"{finer} (set problem.time_step: {used} for other commands)." * (stated != used)]
     text += [links + f"{divided.setting_text}." if divided else "", blocks * result.is_split_in_blocks]
@@ -269,8 +270,8 @@ def _remains(result: DiagnosisResult) -> list[str]:
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     sizes = ((x, name, unit) if unit != "m" else (1e6 * x, name, "mm") for x, name, unit in beyond)
     worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in sizes}
-    mostly = "".join(f". Most of this error comes from {own.location}" for own in result.remaining_gap_locations[:1])
-    effects = result.accepted_effects
+    effects, places = result.accepted_effects, [own.location for own in result.remaining_gap_locations]
+    mostly = f". Most of this error comes from {places[0]}" if effects and places else ""
     who = "the model with the effects" if effects else "the nominal model"
     now = f". Its chi2 per degree of freedom there is {_short(result.remaining_test.chi2_per_dof)}" * bool(effects)
     said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}{now}."

@@ -406,9 +406,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["recordings"]:
         ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
     if issues or warnings or coarse:
-        ended = (
-            f"A run is possible, but before you use its values, read the {'issues' if issues else 'warnings'} below."
-        )
+        ended = f"A run is possible. First follow the advice on the {'issues' if issues else 'warnings'} below."
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."

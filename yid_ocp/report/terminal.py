@@ -212,11 +212,12 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
-    """Return a sentence on joints whose torque offset is over twice its expected size. Empty if there are none."""
-    every = (pair for entry in result.get("torque_offsets", {}).values() for pair in entry.items())
+    """Return a sentence on the sizes of torque offsets, relative to those that are expected. Empty without offsets."""
+    every = [pair for entry in result.get("torque_offsets", {}).values() for pair in entry.items()]
     large = dict.fromkeys(joint for joint, own in every if abs(own["value"]) > 2 * own["prior_std"])
-    do = "The estimates take this into account. Check the calibration of the torque sensor."
-    return f"The torque offset of {', '.join(large)} is over twice the expected size. {do}" if large else ""
+    said = f"The torque offset of {', '.join(large)} is" if large else "No torque offset is"
+    do = " Check the calibration of the torque sensor." * bool(large)
+    return f"{said} over twice the expected size. The estimates take the offsets into account.{do}" if every else ""
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
