@@ -168,9 +168,10 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
     if seen.is_corrected_for_links:
         return seen
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
-    is_long, how = fit.problem.step.time_step > _LONGEST_FINAL_TIME_STEP, (fit, seen.events, is_refitted)
-    if is_long and (fall := _fall_at_half_time_step(seen.search, *how)) > least:
-        return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
+    if fit.problem.step.time_step > _LONGEST_FINAL_TIME_STEP:
+        fall = _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
+        if fall > least:
+            return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
     return seen if is_refitted else _without_error_of_links(seen, fit, least)
 
 
