@@ -31,6 +31,7 @@ FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0))
 TILT = effect("gravity_tilt@world", *(amplitude(n, lower=-1.0, expected=(-0.5, 0.5)) for n in ("rx", "ry")))
 SOLID = effect("standard_linear_solid@T2", amplitude(neutral=1.0, expected=(1.0, 3.0)), shape())
 ABROAD = effect("clock_scale@clock", amplitude())
+LIBRARY = (DAMPER, FRICTION, TILT, SOLID)
 
 
 def system(driven=("s0", "s1", "w0"), prescribed=()):
@@ -61,11 +62,6 @@ def problem(of=None):
     )
 
 
-def detectable(of, columns):
-    """What a generator is told of a candidate's sensitivity."""
-    return {"effect": of.label, "shape": dict.fromkeys(of.shape_parameter_names, 0.25), "columns": columns}
-
-
 @pytest.fixture
 def drawn(monkeypatch):
     """drawn(...): an ensemble whose recordings are made up; `made` remembers what was simulated."""
@@ -81,13 +77,23 @@ def drawn(monkeypatch):
     def multisine(of, truth, **settings):
         return {"of": of, "truth": dict(truth), **settings}
 
-    def build(seed=3, candidates=(DAMPER, FRICTION, TILT, SOLID), finer=None, failures=0, conditions=None, **given):
+    def build(
+        seed=3,
+        candidates=(DAMPER, FRICTION, TILT, SOLID),
+        finer=None,
+        failures=0,
+        conditions=None,
+        columns=None,
+        **given,
+    ):
         build.failures = failures
         monkeypatch.setattr(module, "make_candidate_effects", lambda *_: list(candidates))
         ensemble = BlindCaseGenerator(problem(**given), seed, finer, conditions=conditions)
-        columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
-        seen = [detectable(of, columns.get(of.kind, [[50.0]])) for of in candidates]
-        ensemble.set_candidate_sensitivities_from_list(seen)
+        columns = columns or {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
+        shapes = [dict.fromkeys(of.shape_parameter_names, 0.25) for of in candidates]
+        factors = [np.array(columns.get(of.kind, [[50.0]])) for of in candidates]
+        known = list(zip(candidates, shapes, factors, strict=True))
+        monkeypatch.setattr(ensemble, "_detectable_candidates", lambda *recordings: known)
         return ensemble
 
     monkeypatch.setattr(module, "run_experiment_with_injected_effects", experiment)
@@ -123,8 +129,8 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", linearized)
-    [told] = BlindCaseGenerator(ensemble.problem, 3, None).candidate_sensitivity_dicts()
-    assert np.abs(told["columns"]) == 2.0
+    [(of, _, factor)] = BlindCaseGenerator(ensemble.problem, 3, None)._detectable_candidates([], None)
+    assert (of, np.abs(factor)) == (DAMPER, 2.0)
 
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
@@ -158,8 +164,8 @@ def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
 def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(drawn):
     case, told = of_category(drawn(), "single")
     [injected] = told.injected
-    assert [made["injected"] for made in drawn.made] == [(injected,)] * 2
-    assert [made["truth"] for made in drawn.made] == [told.truth | {"T1.damping": 0.07}] * 2  # as recordings state
+    assert [made["injected"] for made in drawn.made] == [(), (), (injected,), (injected,)]
+    assert [made["truth"] for made in drawn.made] == [told.truth | {"T1.damping": 0.07}] * 4  # as recordings state
     assert case.excluded_kinds[0] not in (injected.kind, "")
     assert told.multiple is not None
 
@@ -192,23 +198,15 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     assert module.CaseGroundTruth.from_dict(json.loads(json.dumps(asdict(first[3])))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
-    # no two recordings share their motion or their noise
-    seeds = [seed for own in made for seed in (own["motion"]["seed"], own["seed"])]
-    assert len(set(seeds)) == len(seeds) == 16
-    assert max(seeds) > 2**24
+    # the effect is detectable in the motion and noise of the case; no two other recordings share them
+    seeds = [[own["motion"]["seed"], own["seed"]] for own in made]
+    assert (seeds[::4], seeds[1::4]) == (seeds[2::4], seeds[3::4])
+    assert len({seed for own in seeds for seed in own}) == 16
+    assert np.max(seeds) > 2**24
     assert drawn(seed=9).draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
     calibrating = drawn(conditions=SyntheticRecordingConditions(purpose="calibration"))
     assert calibrating.draw_recordings_and_ground_truth(wanted[3])[1].truth != first[3].truth
-
-
-def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().candidate_sensitivity_dicts()))
-    other = drawn(seed=5)
-    other.set_candidate_sensitivities_from_list(told)
-    assert other.candidate_sensitivity_dicts() == told
-    assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
-    assert of_category(other, "single", 3.0)[1] == of_category(drawn(seed=5), "single", 3.0)[1]
 
 
 WEIGHTS = {"a": 0.4, "b": 0.2, "bare": 0.1}
@@ -318,9 +316,8 @@ def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
     },
 )
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
-    ensemble = drawn(candidates=(of,))
     columns = [[column]] if len(of.amplitude_parameter_names) == 1 else [[0.6 * column, 0.8 * column]]
-    ensemble.set_candidate_sensitivities_from_list([detectable(of, columns)])
+    ensemble = drawn(candidates=(of,), columns={of.kind: columns})
     for number in range(5):
         told = ensemble.draw_recordings_and_ground_truth(PlannedBlindCase(number, "one", "single", wanted))[1]
         [found], values = told.injected, np.array(list(told.injected[0].values.values()))

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, ProjectedCandidatesLinearization, linearize_candidates
+from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, linearize_candidates
 from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
@@ -283,41 +283,6 @@ class BlindCaseGenerator:
         made = simulate_random_motion(nominal, system, posture, own, values, injected, rng, conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
-    def _linearize_clean_recordings(self) -> ProjectedCandidatesLinearization:
-        """Return the candidates' signatures on recordings without effects."""
-        rng = self._rng(0)
-        names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
-        *clean, other = [self.simulate_synthetic_recording(self._draw_true_parameters(rng), (), rng, n) for n in names]
-        problem = self._nominal_problem(clean)
-        effects = make_candidate_effects(problem.system, clean, self._candidates)
-        composed = AllCandidatesProblem.from_problem(problem, effects, [other])
-        nominal = fit_nominal_model(problem, composed, limits=self._limits)
-        # whitened by all noise, including torque noise
-        return linearize_candidates(replace(composed, problem=nominal.problem), (), nominal.values)
-
-    @cached_property
-    def _detectable(self) -> tuple[_Detectable, ...]:
-        """Every candidate with its sensitivity on recordings without effects."""
-        return tuple(
-            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
-            for s in self._linearize_clean_recordings().signatures
-        )
-
-    def candidate_sensitivity_dicts(self) -> list[dict[str, Any]]:
-        """Return the sensitivities of all candidates, from which detectable sizes follow, in JSON-compatible form."""
-        return [
-            {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
-            for effect, shape, factor in self._detectable
-        ]
-
-    def set_candidate_sensitivities_from_list(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Set sensitivities that `candidate_sensitivity_dicts` of another generator of this experiment returned."""
-        by_label = {effect.label: effect for effect in self._effects}
-        self._detectable = tuple(
-            (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
-            for own in detectable
-        )
-
     def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
@@ -327,78 +292,65 @@ class BlindCaseGenerator:
         options = replace(nominal.options, path_cutoff=cutoff)
         return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
+    def _detectable_candidates(self, clean: Sequence[Recording], held_out: Recording) -> list[_Detectable]:
+        """Return every candidate with its sensitivity on recordings without effects."""
+        problem = self._nominal_problem(clean)
+        effects = make_candidate_effects(problem.system, clean, self._candidates)
+        composed = AllCandidatesProblem.from_problem(problem, effects, [held_out])
+        nominal = fit_nominal_model(problem, composed, limits=self._limits)
+        # whitened by all noise, including torque noise
+        point = linearize_candidates(replace(composed, problem=nominal.problem), (), nominal.values)
+        return [
+            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
+            for s in point.signatures
+        ]
+
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
         """Return the recordings of a planned case, and its label. Raises `ModelError` if no draw can be simulated."""
         name = f"case_{planned.number:03d}"
-        purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
+        names = [*(f"{name}_estimate_{i}" for i in range(self.conditions.estimation_count)), f"{name}_held_out"]
         for attempt in range(MAX_DRAWS_PER_CASE):
-            rng = self._rng(1, planned.number, attempt)
+            path = 1, planned.number, attempt
+            rng, motions = self._rng(*path), partial(self._rng, *path, 1)  # motions and noise with and without effects
             truth = self._draw_true_parameters(rng)
-            injected, multiple = self._injected(planned, rng)
             try:
-                *estimate, held_out = (
-                    self.simulate_synthetic_recording(truth, injected, rng, f"{name}_{purpose}", planned)
-                    for purpose in (*purposes, "held_out")
-                )
+                injected, multiple = self._injected(planned, truth, rng, motions(), names)
+                own = motions()
+                made = [self.simulate_synthetic_recording(truth, injected, own, each, planned) for each in names]
             except YidError as error:
                 lately = error.what  # this motion cannot be simulated or recorded; draw another
                 continue
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
-            return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
+            return UnlabelledCase(name, tuple(made[:-1]), made[-1], left_out), label
         what = f"MuJoCo simulated none of {MAX_DRAWS_PER_CASE} random motions, lately because {lately}"
         allowed = "one motion that stays finite"
         where, hint = f"{name} of experiment {planned.experiment}", "set another --seed; next, a larger model.damping"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
-        kinds = sorted({e.kind for e, *_ in self._detectable} - {effect.kind for effect in injected})
+        kinds = sorted({effect.kind for effect in self._effects} - {effect.kind for effect in injected})
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
-        self, wanted: PlannedBlindCase, rng: np.random.Generator
+        self,
+        wanted: PlannedBlindCase,
+        truth: Mapping[str, float],
+        rng: np.random.Generator,
+        motions: np.random.Generator,
+        names: Sequence[str],
     ) -> tuple[tuple[InjectedEffect, ...], float | None]:
+        """Draw the effects of a case, with sizes relative to the detectable sizes in the motions of this case."""
         if wanted.category in ("null", "finer_chain"):
             return (), None
         if wanted.category == "outside":
             return (self._outside(rng),), None
         size = _DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
-        drawn = [self._inside(rng, size) for _ in range(2 if wanted.category == "pair" else 1)]
+        clean = [self.simulate_synthetic_recording(truth, (), motions, name, wanted) for name in names]
+        detectable = self._detectable_candidates(clean[:-1], clean[-1])
+        drawn = [_inside(detectable, rng, size) for _ in range(2 if wanted.category == "pair" else 1)]
         labels = [effect.label for effect, _ in drawn]
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]
-
-    def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
-        """Draw an effect of the library at `wanted` times its detectable size, or the nearest size within its range."""
-        groups: dict[str, dict[str, list[_Detectable]]] = {}
-        for entry in self._detectable:
-            if entry[0].kind in INJECTABLE_EFFECT_KINDS:
-                groups.setdefault(entry[0].kind, {}).setdefault(entry[0].location, []).append(entry)
-        drawn = []
-        for _ in range(40):
-            kind = str(rng.choice(sorted(groups)))
-            shapes = groups[kind][str(rng.choice(sorted(groups[kind])))]
-            found = self._sized(shapes[int(rng.choice(len(shapes)))], rng, wanted)
-            if found is not None and found[1] > 0.9 * wanted:
-                return found[0], wanted
-            drawn += [] if found is None else [found]
-        return max(drawn, key=lambda entry: entry[1])
-
-    def _sized(
-        self, entry: _Detectable, rng: np.random.Generator, wanted: float
-    ) -> tuple[InjectedEffect, float] | None:
-        """Draw amplitudes at `wanted` times the detectable size, limited to the range. None without sensitivity."""
-        (effect, shape, factor), names = entry, entry[0].amplitude_parameter_names
-        neutral = np.array([effect.neutral_values[n] for n in names])
-        low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
-        way = rng.uniform(low, high)
-        seen = float(np.linalg.norm(factor @ way))
-        if seen <= 0:
-            return None
-        reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-        times = min(wanted * DETECTABLE_AMPLITUDE_Z / seen, float(reach))
-        values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
-        reported = {name: told.value for name, told in effect.to_reported_parameters(values).items()}
-        return InjectedEffect(effect.kind, effect.location, reported), times * seen / DETECTABLE_AMPLITUDE_Z
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.simulated_system
@@ -426,6 +378,38 @@ class BlindCaseGenerator:
         if recorded is None or recorded.effort is None or joint not in recorded.names:
             return 10.0
         return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
+
+
+def _inside(detectable: Sequence[_Detectable], rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
+    """Draw an effect of the library at `wanted` times its detectable size, or the nearest size within its range."""
+    groups: dict[str, dict[str, list[_Detectable]]] = {}
+    for entry in (own for own in detectable if own[0].kind in INJECTABLE_EFFECT_KINDS):
+        groups.setdefault(entry[0].kind, {}).setdefault(entry[0].location, []).append(entry)
+    drawn = []
+    for _ in range(40):
+        kind = str(rng.choice(sorted(groups)))
+        shapes = groups[kind][str(rng.choice(sorted(groups[kind])))]
+        found = _sized(shapes[int(rng.choice(len(shapes)))], rng, wanted)
+        if found is not None and found[1] > 0.9 * wanted:
+            return found[0], wanted
+        drawn += [] if found is None else [found]
+    return max(drawn, key=lambda entry: entry[1])
+
+
+def _sized(entry: _Detectable, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float] | None:
+    """Draw amplitudes at `wanted` times the detectable size, limited to the range. None without sensitivity."""
+    (effect, shape, factor), names = entry, entry[0].amplitude_parameter_names
+    neutral = np.array([effect.neutral_values[n] for n in names])
+    low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
+    way = rng.uniform(low, high)
+    seen = float(np.linalg.norm(factor @ way))
+    if seen <= 0:
+        return None
+    reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
+    times = min(wanted * DETECTABLE_AMPLITUDE_Z / seen, float(reach))
+    values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
+    reported = {name: told.value for name, told in effect.to_reported_parameters(values).items()}
+    return InjectedEffect(effect.kind, effect.location, reported), times * seen / DETECTABLE_AMPLITUDE_Z
 
 
 def simulate_random_motion(

@@ -205,7 +205,7 @@ class _Proof:
         tasks = []
         for entry in plan:
             name = entry.experiment
-            known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json", "folder": str(cases)}
+            known = {"first": prepared / f"{name}.h5", "folder": str(cases)}
             tasks.append(Task(f"case {entry.number}", {**told[name], **known, "planned": asdict(entry)}))
         made = self.done(_draw_case, tasks, "sealed/drawn")
         text, digest = blind.labels_json_and_sha256([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
@@ -237,22 +237,14 @@ class _Proof:
         return [values[i] for i in range(len(tasks))]
 
 
-def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> dict[str, int]:
-    """Task: write an experiment's first recording and the detectable size of every candidate."""
-    first = Path(folder) / f"{name}.h5"
-    _BlindExperiment(**experiment)._write_first_recording(first)
-    _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.candidate_sensitivity_dicts()
-    write_strict_json(Path(folder) / f"{name}.json", detectable)
-    return {"candidates": len(detectable)}
+def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -> None:
+    """Task: write an experiment's first recording."""
+    _BlindExperiment(**experiment)._write_first_recording(Path(folder) / f"{name}.h5")
 
 
-def _draw_case(
-    experiment: Mapping[str, Any], first: Path, detectable: Path, planned: Mapping[str, Any], folder: str
-) -> dict[str, Any]:
+def _draw_case(experiment: Mapping[str, Any], first: Path, planned: Mapping[str, Any], folder: str) -> dict[str, Any]:
     """Task: simulate and write the recordings of a case. Returns its label, and the data that its diagnosis may use."""
     _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.set_candidate_sensitivities_from_list(read_input_json(detectable))
     case, label = ensemble.draw_recordings_and_ground_truth(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
