@@ -138,9 +138,11 @@ def are_arm_states_estimated(run: RunSettings) -> bool:
     """Return whether arms of `mode: prescribed` are simulated as driven by measured torques, with estimated states.
 
     This needs a grasp and recorded efforts. The encoders then correct the states. Arms with sensors on links remain
-    prescribed, because such sensors cannot be weighted under process noise.
+    prescribed, because such sensors cannot be weighted under process noise. So do arms that an object is mounted on,
+    because the tracking filter would need their own momentum.
     """
-    if run.model.arms.mode != "prescribed" or not run.model.grasp:
+    is_mounted = run.model.object is not None and run.model.object.parent_frame_and_root_pose[0] is not None
+    if run.model.arms.mode != "prescribed" or not run.model.grasp or is_mounted:
         return False
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):

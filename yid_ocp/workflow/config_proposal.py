@@ -160,7 +160,7 @@ def propose_config_choices(
         for name in (name for name in joints if name not in other.joint_names):
             what, hint = f"the recording lacks the joint '{name}', which {first.name} has", "leave this recording out"
             raise ConfigError(what, where=other.name, allowed=f"the joints {', '.join(joints)}", hint=hint)
-    mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
+    mode, why = _mode(first, recorded, bool(held) and standing, has_object=bool(branches))
     moving = ""
     for recording in recordings:
         start = min(group.t[0] for group in recording.joint_and_point_groups)
