@@ -297,7 +297,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         ("__time,/joint_states/a/position,/joint_states/a/velocity,/joint_states/a/effort",
          "t position:a velocity:a effort:a"),
         ("%time,field.position0,field.velocity0,field.effort0", "t position:0 velocity:0 effort:0"),
-        ("time,q[0],dq[0],tau_J[0]", "t position:0 velocity:0 effort:0"),
+        ("time,q[0],dq[0],tau_J[0],elbow_joint.velocity", "t position:0 velocity:0 effort:0 velocity:elbow_joint"),
         ("t,q_j1,tau_j1,q_d_1,q1_cmd", "t position:j1 effort:j1 position_command:1 position_command:1"),
         ("timestamp,actual_q_0,actual_qd_0,target_q_0", "t position:0 velocity:0 position_command:0"),
         ("time [µs],q_a [°],/ft/wrench/torque/x", "t position:a None"),

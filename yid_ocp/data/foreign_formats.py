@@ -95,10 +95,9 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
     for word in _LONGEST_FIRST:
         channel = _CHANNEL_BY_WORD[word]
         case = re.IGNORECASE if word.islower() else 0
-        if found := re.fullmatch(rf"{word}_?(\d+)", plain, case):
-            return channel, found[1]
-        if found := re.fullmatch(rf"{word}_(.+)|(?:q_?(?=\d+_))?(.+)_{word}", plain, case):
-            return channel, found[1] or found[2]
+        end = word.removeprefix("joint_")  # `joint` belongs to a name before it, such as `elbow_joint.position`
+        if found := re.fullmatch(rf"{word}_?(\d+)|{word}_(.+)|(?:q_?(?=\d+_))?(.+)_{end}", plain, case):
+            return channel, found[1] or found[2] or found[3]
     return None
 
 
