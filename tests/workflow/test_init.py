@@ -399,6 +399,11 @@ def test_on_a_rod_that_was_straight_a_marker_is_placed_within_a_fraction_of_a_mi
     assert (rounded.parent_frame, rounded.position_std) == ("cable:35%", pytest.approx(0.015 * LENGTH, rel=0.05))
 
 
+def test_arms_that_hold_both_ends_of_a_rod_move_as_measured(bench: Path) -> None:
+    system = build_system(proposed(moved(SHORT, effort=True), *CABLE, "--grasp", "hub=w_cable"))
+    assert system.prescribed == ("roll", "pitch"), "the tracking filter needs arms that carry no object"
+
+
 SWING = """<robot name="swing"><link name="base"/><link name="upper"><inertial><mass value="1"/>
   <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tool"/>
   <joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>

@@ -362,13 +362,13 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         wanted = np.sqrt(np.mean(needed**2, axis=0))
         dead = (np.max(np.abs(motion.effort), axis=0) < 1e-3 * wanted) & (wanted > least)
         if dead.any():
-            which, asked = ", ".join(np.array(arm.joint_names)[dead]), float(np.max(wanted[dead]))
-            which = "all joints" if dead.all() else which
-            words = f"the effort of {which} is zero throughout, but gravity and motion require {asked:.2g} N m (rms)"
+            which = "all joints" if dead.all() else ", ".join(np.array(arm.joint_names)[dead])
+            words = f"the effort of {which} is zero throughout, but gravity and motion require "
+            words += f"{np.max(wanted[dead]):.2g} N m (rms)"
             advice = "record efforts, or move the arms as measured and use no efforts"
             setting = "model.arms.mode: prescribed; sensors.joints.effort.use: false"
             found.append(_issue("effort_zero", words, 1e3, advice, setting=setting))
-        else:
+        elif arm._has_no_unknown_descendants or not arm.system.grasps:  # no closed loop of any load
             # a delayed oscillation looks like a flipped sign, so delays are tested first
             data = _Data(arm, motion, motion.effort, needed, size)
             fit = _fitted(data)

@@ -137,19 +137,17 @@ def cable_vertices_between_clamps(run: RunSettings) -> CableVertices | None:
 def are_arm_states_estimated(run: RunSettings) -> bool:
     """Return whether arms of `mode: prescribed` are simulated as driven by measured torques, with estimated states.
 
-    This needs a grasp and recorded efforts. The encoders then correct the states. Arms with sensors on links remain
-    prescribed, because such sensors cannot be weighted under process noise. So do arms that an object is mounted on,
-    because the tracking filter would need their own momentum.
+    This needs a grasp, no object mounted on an arm, and recorded efforts. The encoders then correct the states. Arms
+    with sensors on links remain prescribed, because such sensors cannot be weighted under process noise.
     """
-    is_mounted = run.model.object is not None and run.model.object.parent_frame_and_root_pose[0] is not None
-    if run.model.arms.mode != "prescribed" or not run.model.grasp or is_mounted:
+    item = run.model.object
+    if run.model.arms.mode != "prescribed" or not run.model.grasp or (item and item.parent_frame_and_root_pose[0]):
         return False
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
-        of_vectors = (kind.quantity for kind in channel_specs_for_group_name(group.name) if kind.components)
-        for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
-            said = run.sensors.get(f"{group.name}.{quantity}")
-            if said is None or said.use is not False:
+        for kind in (kind for kind in channel_specs_for_group_name(group.name) if kind.components):
+            said = run.sensors.get(f"{group.name}.{kind.quantity}")
+            if kind.quantity in group.values_by_quantity and (said is None or said.use is not False):
                 return False
     return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 

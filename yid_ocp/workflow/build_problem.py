@@ -126,8 +126,8 @@ def _refuse_object_mounted_on_driven_arm(run: RunSettings, system: System) -> No
         of_arm = i in driven or name in run.model.arms.passive_joints
         if not of_arm and driven.intersection(tree.ancestor_joint_indices(i)):
             what = f"{name} of the object is mounted on a driven arm, whose tracking filter needs its own momentum"
-            hint = "set problem.arm_tracking_feedback: proportional, or model.arms.mode: prescribed; or use model.grasp"
-            allowed = "a driven arm that holds its object by a grasp"
+            hint = "set model.arms.mode: prescribed, or problem.arm_tracking_feedback: proportional"
+            allowed = "a driven arm that holds its object only by grasps"
             raise run.config_error(what, "model", "object", "mount", allowed=allowed, hint=hint)
 
 
