@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -308,37 +307,38 @@ class BlindCaseGenerator:
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
         """Return the recordings of a planned case, and its label. Raises `ModelError` if no draw can be simulated."""
         name = f"case_{planned.number:03d}"
-        names = [*(f"{name}_estimate_{i}" for i in range(self.conditions.estimation_count)), f"{name}_held_out"]
         for attempt in range(MAX_DRAWS_PER_CASE):
-            path = 1, planned.number, attempt
-            rng, motions = self._rng(*path), partial(self._rng, *path, 1)  # motions and noise with and without effects
+            rng = self._rng(1, planned.number, attempt)
             truth = self._draw_true_parameters(rng)
             try:
-                injected, multiple = self._injected(planned, truth, rng, motions(), names)
-                own = motions()
-                made = [self.simulate_synthetic_recording(truth, injected, own, each, planned) for each in names]
+                injected, multiple = self._injected(planned, truth, attempt, rng)
+                *estimate, held_out = self._case_recordings(planned, truth, injected, attempt)
             except YidError as error:
                 lately = error.what  # this motion cannot be simulated or recorded; draw another
                 continue
             left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
-            return UnlabelledCase(name, tuple(made[:-1]), made[-1], left_out), label
+            return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
         what = f"MuJoCo simulated none of {MAX_DRAWS_PER_CASE} random motions, lately because {lately}"
         allowed = "one motion that stays finite"
         where, hint = f"{name} of experiment {planned.experiment}", "set another --seed; next, a larger model.damping"
         raise ModelError(what, where=where, allowed=allowed, hint=hint)
+
+    def _case_recordings(
+        self, planned: PlannedBlindCase, truth: Mapping[str, float], injected: Sequence[InjectedEffect], attempt: int
+    ) -> list[Recording]:
+        """Simulate a case, the last recording held out. Motions and noise are the same with and without effects."""
+        rng, estimate = self._rng(1, planned.number, attempt, 1), range(self.conditions.estimation_count)
+        purposes = (*(f"estimate_{i}" for i in estimate), "held_out")
+        names = (f"case_{planned.number:03d}_{purpose}" for purpose in purposes)
+        return [self.simulate_synthetic_recording(truth, injected, rng, name, planned) for name in names]
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         kinds = sorted({effect.kind for effect in self._effects} - {effect.kind for effect in injected})
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
-        self,
-        wanted: PlannedBlindCase,
-        truth: Mapping[str, float],
-        rng: np.random.Generator,
-        motions: np.random.Generator,
-        names: Sequence[str],
+        self, wanted: PlannedBlindCase, truth: Mapping[str, float], attempt: int, rng: np.random.Generator
     ) -> tuple[tuple[InjectedEffect, ...], float | None]:
         """Draw the effects of a case, with sizes relative to the detectable sizes in the motions of this case."""
         if wanted.category in ("null", "finer_chain"):
@@ -346,8 +346,8 @@ class BlindCaseGenerator:
         if wanted.category == "outside":
             return (self._outside(rng),), None
         size = _DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
-        clean = [self.simulate_synthetic_recording(truth, (), motions, name, wanted) for name in names]
-        detectable = self._detectable_candidates(clean[:-1], clean[-1])
+        *clean, held_out = self._case_recordings(wanted, truth, (), attempt)
+        detectable = self._detectable_candidates(clean, held_out)
         drawn = [_inside(detectable, rng, size) for _ in range(2 if wanted.category == "pair" else 1)]
         labels = [effect.label for effect, _ in drawn]
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]

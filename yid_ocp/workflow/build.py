@@ -34,6 +34,7 @@ from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
+from yid_ocp.problem.options import SensorOptions
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import (
@@ -146,8 +147,8 @@ def are_arm_states_estimated(run: RunSettings) -> bool:
     recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
         for kind in (kind for kind in channel_specs_for_group_name(group.name) if kind.components):
-            said = run.sensors.get(f"{group.name}.{kind.quantity}")
-            if kind.quantity in group.values_by_quantity and (said is None or said.use is not False):
+            choice = run.sensors.get(f"{group.name}.{kind.quantity}", SensorOptions())
+            if kind.quantity in group.values_by_quantity and choice.use is not False:
                 return False
     return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 
