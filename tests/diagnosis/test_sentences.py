@@ -208,7 +208,7 @@ def said() -> dict[str, str]:
         {"melting@T1": "how hot it is", "density@T1": ACCELERATION},
     ]:  # fmt: skip
         alike = [SimpleNamespace(label=k, location=k.split("@")[1], required_excitation=v) for k, v in rivals.items()]
-        made = SimpleNamespace(accepted_selected_effects=(SimpleNamespace(equivalent_effects=alike),))
+        made = finding(selected_effects=(SimpleNamespace(equivalent_effects=alike),))
         found[f"next experiment: rivals {list(rivals)}"] = recommended_experiment_text(made)
     force = ForceOrFaultEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
     odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")

@@ -241,7 +241,9 @@ def _with_changed_parameters(
     if not released or distance > 1.0:
         return seen, judged
     if judged.accepted_selected_effects and distance > -1.0:
-        return seen, judged.with_confusable_parameter_changes(released, distance)
+        probability, rivals = judged.probability * select.relative_probability(distance), tuple(released)
+        more = replace(judged, verdict="confusable", probability=probability, confusable_parameter_changes=rivals)
+        return seen, more
     with contextlib.suppress(SolverError):
         anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):

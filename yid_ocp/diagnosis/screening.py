@@ -290,9 +290,7 @@ class _JointScoreModel:
         return sorted(found, key=lambda pair: -pair[-1])
 
 
-def _make_joint_score_model(
-    point: ProjectedCandidatesLinearization, chosen: Sequence[ScoreTestResult] = ()
-) -> _JointScoreModel:
+def _joint_score_model(point: ProjectedCandidatesLinearization, chosen: Sequence[ScoreTestResult]) -> _JointScoreModel:
     """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     kept = []
@@ -351,7 +349,7 @@ def screen_candidates(
     # the smallest amplitude of each that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
     visible = tuple(min(e, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values()))) for e in found)
     ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
-    everything = _make_joint_score_model(point, ranked)
+    everything = _joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)
 
 

@@ -218,8 +218,10 @@ def select_effects(
     limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
     fits = refit_with_each_effect(search, (), shortlist, nominal.values)
-    if moved:
-        fits = sorted([*fits, *_refits_from_earlier_run(search)], key=lambda fit: -fit.cost)
+    where = "from the earlier run's parameters"  # the nominal fit supplies missing ones
+    if moved and not search.is_skipped_past_deadline(f"candidates {where}"):
+        again = _refit_shortlist(search.screen((), {}, where), limits)
+        fits = sorted([*fits, *refit_with_each_effect(search, (), again, {}, where)], key=lambda fit: -fit.cost)
     single = {fit.effects[0].label: fit for fit in fits}  # of two fits the one that costs less, which is the last
     near = _near_best_models(nominal, list(single.values()), limits)
     best = next((fit.effects[0].label for fit, _ in near), "")
@@ -264,15 +266,6 @@ def select_effects(
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
         added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
     return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)
-
-
-def _refits_from_earlier_run(search: RefitContext) -> list[RefitStatistics]:
-    """Candidates refitted from the earlier run's parameters; the nominal fit supplies missing parameters."""
-    where = "from the earlier run's parameters"
-    if search.is_skipped_past_deadline(f"candidates {where}"):
-        return []
-    screened = search.screen((), {}, where)
-    return refit_with_each_effect(search, (), _refit_shortlist(screened, search.thresholds), {}, where)
 
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
+from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import abbreviated_names_text, count_with_noun, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text as listed
+from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
-from yid_ocp.inference.smoother import select_largest_gap_locations
+from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
@@ -35,60 +35,49 @@ GAP_ORIGIN_TEXTS = {
 }
 
 
+def _said(*rows: tuple[object, str]) -> list[str]:
+    """The texts whose condition holds, or is not empty."""
+    return [text for holds, text in rows if holds]
+
+
 def recommended_experiment_text(result: DiagnosisResult) -> str:
     """Recommend the next recording in one sentence, based on verdict, gap location and confusable effects."""
+    rows = list[tuple[object, str]]()
     for rivals in (entry.equivalent_effects for entry in result.accepted_selected_effects):
         aspects = list(dict.fromkeys(effect.required_excitation for effect in rivals))
         places = list(dict.fromkeys(effect.location for effect in rivals))
-        at = next((f" of {place}" for place in places if place not in _IMMOVABLE_LOCATIONS), "")
-        advice = (
-            (aspects, f"Record one motion{at} in which these vary independently and widely: {', '.join(aspects)}."),
-            (places, f"Move {' and '.join(places)} one after the other, or measure a point between them."),
-            (rivals, f"Record a motion in which {aspects[0]}{at} varies over a wider range."),
-        )
-        if told := [text for several, text in advice if len(several) > 1]:
-            return f"{told[0]} This can separate these effects: {', '.join([effect.label for effect in rivals])}."
+        at = "".join([f" of {place}" for place in places if place not in _IMMOVABLE_LOCATIONS][:1])
+        apart = f"Record one motion{at} in which these vary independently and widely: {', '.join(aspects)}."
+        in_turn = f"Move {' and '.join(places)} one after the other, or measure a point between them."
+        wider = f"Record a motion in which {aspects[0]}{at} varies over a wider range."
+        end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
+        rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
     still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
-    place = [p.location for p in result.gap_locations[:1] if p.gap_share > 0 and p.location not in still]
-    mostly = _listed("Record slow and fast motions, with pauses, and most motion at ", place, " (where the gap is).")
+    movable = {place.location for place in _named_locations(result)[:1]} - still
+    most = f"Record slow and fast motions, with pauses, and most motion at {''.join(movable)} (where the gap is)."
+    larger = "Record faster and larger motions of all joints, which show more effects."
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
-        "unknown": mostly or "Record faster and larger motions of all joints, which show more effects.",
-        "no_gap": "None is needed: the model explains motions like these. Other motions may still show a gap.",
+        "unknown": _said((movable, most), (True, larger))[0],
+        "no_gap": "Nothing is needed for motions like these. Other motions may still show a gap.",
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. If the named cause is right, its estimates stay the same.",
     }
-    repeat = "None yet. First repeat the diagnosis with the effect that is significant at several locations."
-    return repeat if _several_places(result) else texts[result.verdict]
+    return _said(*rows, (True, texts[result.verdict]))[0]
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
-    """Summarise a diagnosis in lines: the gap, locations, effects, remaining error, events and next experiment."""
-    stopped = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
-    untried = _listed(stopped, result.untried, ". To test them, raise this limit.")
-    text = [" ".join([*_use(result), _gap(result)]), untried]
-    if result.verdict not in ("insufficient_data", "no_gap"):
-        (error, change), found = _remains(result), [gap_locations_sentence(result, has_origin=True), *_causes(result)]
-        text += [*found, error, change] if result.accepted_effects else [error, *found, change]
+    """Summarise a diagnosis in lines: may the model be used, is there a gap and why, what else matters, what to do."""
+    step, notes = result.stated_and_used_time_step[1], _notes(result)
+    text = [_lead(result)]
+    text += {"insufficient_data": [], "no_gap": _why_no_gap(result)}.get(result.verdict, _why_gap(result))
     text += [] if result.law is None else [result.law.sentence]
-    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
-    step = result.stated_and_used_time_step[1]
     text += [held_out_truncation_message(cut, step) for cut in result.truncated_recordings]
-    text += [*_bound_by_priors(result), *_earlier_runs(result)]
-    finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s"
-    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
-    links = "The model has too few links. The resulting error is not part of these numbers. For other commands, set "
-    blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
-    text += [f"{finer} (set problem.time_step: {used} for other commands)." * (stated != used)]
-    text += [links + f"{divided.setting_text}." if divided else "", blocks * result.is_split_in_blocks]
-    kinds, events = {"force": "push of", "sample": "wrong samples of"}, result.events.disturbances
-    where = "{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'"
-    told = [f"{kinds[e.kind]} {where.format(e=e)}" for e in events]
-    check = "If you did not push the arm on purpose, look at the recordings at these times."
-    left = f"The tests leave out {count_with_noun(len(told), 'brief disturbance')}: "
-    text += [_listed(left, told, f". {check}", max_entries=_MAX_NAMED)]
-    text += [*overspeed_truncation_messages(result), f"Next experiment: {result.next_experiment}"]
-    return "\n".join(filter(None, text))
+    text += [*_bound_by_priors(result), *_earlier_runs(result), *_counterfactual(result.counterfactual)]
+    text += [*filter(None, (note for note, _ in notes)), *overspeed_truncation_messages(result)]
+    steps = [*filter(None, (step for _, step in notes)), result.next_experiment]
+    numbered = " ".join(f"{i}. {step}" for i, step in enumerate(steps, 1))
+    return "\n".join([*text, f"Do next: {_said((steps[1:], numbered), (True, steps[-1]))[0]}"])
 
 
 def held_out_truncation_message(cut: HeldOutTruncation, time_step: float) -> str:
@@ -104,163 +93,205 @@ def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
     return [f"Data of '{e.recording}' after {e.start_time:.3g} {cut} {e.joint} {why}" for e in cuts]
 
 
-def _listed(beginning: str, names: Iterable[str], end: str = ".", **limit: int) -> str:
-    """Sentence on names, similar ones merged. Empty if there are none."""
-    text = abbreviated_names_text([*names], **limit)
-    return f"{beginning}{text}{end}" if text else ""
-
-
 def _short(number: float) -> str:
     return f"{number:.3g}" if number < 1000 else f"{number:.0f}"
 
 
-def _use(result: DiagnosisResult) -> Iterator[str]:
-    """Yield sentences on whether a model with a gap may be used, and on the most probable cause."""
-    rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
-    if result.verdict == "unknown":
-        yield "Do not use the estimates, because the cause of the model's error is unknown."
-    elif result.verdict == "confusable":
-        yield "Do not use the estimates yet, because several causes explain the model's error about equally well."
-    elif result.verdict == "effect":
-        is_left = result.remaining_test.p_value < result.thresholds.significance_level
-        beyond = ", but expect errors beyond noise" * is_left
-        names = abbreviated_names_text([effect.label for effect in result.accepted_effects])
-        yield f"Use the model with {names}, not the nominal one{beyond}."
-    if rivals:
-        causes = " and ".join(f"{'one of ' * (len(own) > 1)}{abbreviated_names_text(own)}" for own in rivals)
-        yield f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
-
-
-def _gap(result: DiagnosisResult) -> str:
-    """Sentence on whether there is a gap."""
-    tests, scores = (result.nominal_test, result.nominal_held_out_test), result.screening.candidate_scores
+def _lead(result: DiagnosisResult) -> str:
+    """Whether a model may be used, whether there is a gap, and the most probable cause."""
+    tests, limits = (result.nominal_test, result.nominal_held_out_test), result.thresholds
     fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
-    p_value = min(test.p_value for test in tests)
-    unknowns, seen = len(result.nominal_model.values), [v.is_detectable for v in result.screening.detectability]
-    chance = f"p {p_value_text(p_value, '= ')}: the probability that noise alone gives such an error"
-    if result.verdict == "insufficient_data":
-        dof, few = f"{tests[0].degrees_of_freedom:.0f}", f"more than {unknowns}, the number of unknowns, are needed"
-        said = f"{dof} independent samples ({few}), and would show {sum(seen)} of {len(seen)} effects"
-        return f"The model is not tested: the recordings have {said} (at least 1 is needed)."
-    if result.verdict == "no_gap":
-        said = (
-            f"Use the model for motions like these. There is no relevant gap: {sizes} ({chance}). The recordings would "
-        )
-        said += f"show {sum(seen)} of {len(seen)} effects."
-        return "\n".join(filter(None, [said, *_why_no_gap(result)]))
-    if null_test.residuals_exceed_noise(tests, result.thresholds.null_test_excess_criteria):
-        seen_in = [name for name, test in zip(("fitted", "held-out"), tests, strict=True) if test.chi2_per_dof > 1]
-        only = f" on the {seen_in[0]} motions only" if len(seen_in) == 1 else ""
-        return f"The nominal model has an error beyond noise (a gap){only}: {sizes} ({chance})."
-    best, p_value = min(scores, key=lambda own: own.p_value), bonferroni_corrected_min_candidate_p_value(scores)
-    small = f"But the error has the pattern of the effect {best.effect.label} (p {p_value_text(p_value, '= ')})"
-    return f"In total the error of the nominal model is within noise: {sizes}. {small}."
+    p_value = p_value_text(min(test.p_value for test in tests), "= ")
+    chance = f"(p {p_value}: the probability that noise alone gives such an error)"
+    where = {(True, False): " on the fitted motions only", (False, True): " on the held-out motions only"}
+    only = where.get((tests[0].chi2_per_dof > 1, tests[1].chi2_per_dof > 1), "")
+    best, along = _best_candidate(result)
+    large = f"The nominal model has an error beyond noise (a gap){only}: {sizes} {chance}."
+    small = f"In total the error of the nominal model is within noise: {sizes}. "
+    small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
+    exceeds = null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria)
+    gap = _said((exceeds, large), (True, small))[0]
+    unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
+    shown = f"would show {sum(seen)} of {len(seen)} effects"
+    enough = f"(more than {unknowns}, the number of unknowns, are needed), and {shown} (at least 1 is needed)"
+    few = (
+        f"The model is not tested: the recordings have {tests[0].degrees_of_freedom:.0f} independent samples {enough}."
+    )
+    is_left = result.remaining_test.p_value < limits.significance_level
+    beyond = "".join(_said((is_left, ", but expect errors beyond noise")))
+    names = listed([effect.label for effect in result.accepted_effects])
+    causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
+    probable = f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
+    none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
+    not_yet = "Do not use the estimates yet, because several causes explain the model's error about equally well."
+    return {
+        "insufficient_data": few,
+        "no_gap": none,
+        "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
+        "confusable": f"{not_yet} {probable} {gap}",
+        "effect": f"Use the model with {names}, not the nominal one{beyond}. {probable} {gap}",
+    }[result.verdict]
+
+
+def _rivals(result: DiagnosisResult) -> list[list[str]]:
+    """Labels of each accepted effect and of its equivalents."""
+    return [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
+
+
+def _best_candidate(result: DiagnosisResult) -> tuple[str, float]:
+    """Label of the candidate with the smallest p-value, and this value for as many tries as there are candidates."""
+    scores = result.screening.candidate_scores
+    best = [score.effect.label for score in sorted(scores, key=lambda own: own.p_value)[:1]]
+    return "".join(best), bonferroni_corrected_min_candidate_p_value(scores)
 
 
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on why a significant residual does not count as a gap, and on effects that could be overlooked."""
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
-    scores, level = result.screening.candidate_scores, limits.gap_significance_level
-    best = [own.effect.label for own in sorted(scores, key=lambda own: own.p_value)[:1]]
-    along, least = bonferroni_corrected_min_candidate_p_value(scores), 1 + limits.min_excess_chi2_per_dof
-    needs = f"chi2 per degree of freedom above {least:.4g} and p below {level / len(tests):.2g}"
-    small = "The error is significantly larger than noise, but too small to count as a gap. "
-    seen = f"The error has the pattern of {''.join(best)} (p {p_value_text(along, '= ')} if there is only noise)"
+    (best, along), least = _best_candidate(result), 1 + limits.min_excess_chi2_per_dof
     is_significant = min(test.p_value for test in tests) < limits.significance_level
+    small = "The error is significantly larger than noise, but too small to count as a gap."
+    level = f"p below {limits.gap_significance_level / len(tests):.2g}"
+    needs = f"A gap needs chi2 per degree of freedom above {least:.4g} and {level}."
+    seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    return [f"{small * is_significant}A gap needs {needs}.", narrow * (along < level), unseen_effects_sentence(unseen)]
+    lines = [" ".join(_said((is_significant, small), (True, needs)))]
+    return lines + _said((along < limits.gap_significance_level, narrow), (unseen, unseen_effects_sentence(unseen)))
+
+
+def _named_locations(result: DiagnosisResult) -> list[GapLocation]:
+    return [p for p in select_largest_gap_locations(result.gap_locations) if p.gap_share >= MIN_GAP_SHARE]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
     """Return a sentence on the gap's locations, with inseparable ones together, and if `has_origin` on its origin."""
-    where = [place for place in select_largest_gap_locations(result.gap_locations) if place.gap_share >= MIN_GAP_SHARE]
-    parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
-    if not parts:
+    where = _named_locations(result)
+    if not where:
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
-    parts += [(rest, "elsewhere")] if (rest := 1 - sum(place.gap_share for place in where)) >= MIN_GAP_SHARE else []
-    named = ", ".join(f"{100 * part:.0f} % from {place}" for part, place in parts).replace("% from", "% comes from", 1)
-    origin = result.smoother_result.plant_or_sensor_origin
-    side = f"; its origin is {GAP_ORIGIN_TEXTS[origin]}" * (has_origin and origin in ("plant", "sensor", "either"))
-    return f"Of the error beyond noise that can be located, {named}{side}."
+    origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
+    parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
+    named = [f"{100 * part:.0f} % from {place}" for part, place in parts]
+    named += _said((rest >= MIN_GAP_SHARE, f"{100 * rest:.0f} % from elsewhere"))
+    said = ", ".join(named).replace("% from", "% comes from", 1)
+    is_told = has_origin and origin in ("plant", "sensor", "either")
+    side = _said((is_told, f"; its origin is {GAP_ORIGIN_TEXTS[origin]}"))
+    return f"Of the error beyond noise that can be located, {said}{''.join(side)}."
 
 
-def _causes(result: DiagnosisResult) -> list[str]:
-    """Sentences on the selected effects, and on why the verdict is unknown."""
-    added, total = result.selected_effects, result.closure_by_selected_effects
-    limits, text, s = result.thresholds, list[str](), "s" if len(added) == 1 else ""
-    names = abbreviated_names_text([entry.effect.label for entry in added])
-    if added:
-        part = "an unknown part of the error beyond noise on held-out motions"
-        if result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0:
-            part += ", because the nominal model's error there is within noise"
-        if math.isfinite(total.ci_low):
-            interval = f"95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %"
-            part = f"{100 * total.fraction:.3g} % of the error beyond noise on held-out motions ({interval})"
-        text += [f"{names} remove{s} {part}.", *(_named(e.effect, added[-1].refitted_model, limits) for e in added)]
-    rivals = [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
-    text += [_listed(f"These recordings cannot distinguish {own} from ", others) for own, *others in rivals]
+def _why_gap(result: DiagnosisResult) -> list[str]:
+    """Sentences on where a gap lies, on the selected effects, and on the error that is left."""
+    added, limits = result.selected_effects, result.thresholds
+    names, total = listed([entry.effect.label for entry in added]), result.closure_by_selected_effects
+    removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
+    interval = f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)"
+    unknown = f"{removed} an unknown part {of}"
+    is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
+    closed = _said(
+        (not added, ""),
+        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
+        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
+        (True, f"{unknown}."),
+    )[0]
+    lines = [gap_locations_sentence(result, has_origin=True), *_said((closed, closed))]
+    lines += [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
+    same = "These recordings cannot distinguish"
+    alike = [(others, f"{same} {own} from {listed(others)}.") for own, *others in _rivals(result)]
+    return [*lines, *_said(*alike), *_remains(result)]
+
+
+def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
+    """What limits the diagnosis, such as the reason to name no cause: sentences, each with one on what to do next."""
+    scores, models, events = result.screening.candidate_scores, result.single_effect_models, result.events.disturbances
+    level = result.thresholds.gap_significance_level / max(len(scores), 1)
+    kind = "".join([fit.effects[0].kind for fit in models[:1]])
+    alike = [s.effect for s in scores if s.p_value < level and s.effect.kind == kind and not s.effect.is_local]
+    places = listed([effect.location for effect in alike])
+    several = f"{kind} is significant at several locations (p below {level:.2g}): {places}."
+    add = f"Add {kind} at {places} under model.effects (friction: as `yid-ocp friction` advises), and repeat "
+    limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
+    laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
+    other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
+    what = {"force": "push of", "sample": "wrong samples of"}
+    when = [f"{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'" for e in events]
+    told = listed([f"{what[e.kind]} {own}" for e, own in zip(events, when, strict=True)], max_entries=_MAX_NAMED)
+    left_out = f"The tests leave out {count_with_noun(len(events), 'brief disturbance')}: {told}."
+    check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
+    stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
+    finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
+    blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
+    links = "The model has too few links. The resulting error is not part of these numbers."
+    rows = [
+        (result.unknown_reason, _reason(result)),
+        (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
+        (result.untried, (f"{limit}{listed(result.untried)}.", "Raise diagnosis.budget, to test the rest.")),
+        (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
+        (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
+        (result.is_split_in_blocks, (blocks, "")),
+        (events, (left_out, check)),
+    ]
+    if result.is_corrected_for_links:
+        divided = result.nominal_model.problem.options.divided_links_model
+        assert divided is not None  # it gave the correction
+        rows.append((True, (links, f"For other commands, set {divided.setting_text}.")))
+    return [text for holds, text in rows if holds]
+
+
+def _reason(result: DiagnosisResult) -> tuple[str, str]:
+    """Why no cause is named, and what to do about it."""
+    limits, sizes = result.thresholds, result.undetermined_sizes(result.thresholds)
     (fitted, least), (closed, goal) = result.explained_and_required_fractions(limits)
+    names, unsure = listed([entry.effect.label for entry in result.selected_effects]), listed([*sizes])
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
-    unsure = abbreviated_names_text([*(sizes := result.undetermined_sizes(limits))])
-    size = f"the size of {unsure} is uncertain (less than {limits.min_z:g} ± from no effect, if ± includes the gap)"
+    stopped = "the time limit ended the search before any effect was tried"
+    tried = "no effect that was tried explains the error well enough"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
-    either = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts"
-    none, kinds = "No cause is named, because", {own.effect.kind: None for own in result.screening.candidate_scores}
-    is_narrow = (len(kinds) <= _FEW_KINDS) * (not result.untried)
-    more = f" Tried: only {', '.join(kinds)}. To try more, leave out diagnosis.candidates, if it is set." * is_narrow
-    reasons = {
-        "none": f"{none} no effect that was tried explains the error well enough.{more}",
-        "little": f"{none} {names} explain{s} only {few}{end * math.isfinite(closed)}.",
-        "stand_in": f"{none} {size}{apart}. {either}.",
-    }
-    laws = abbreviated_names_text([entry.effect.label for entry in added if entry.effect.is_joint_friction])
-    alone = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model. "
-    alone += "`yid-ocp friction CONFIG` fits the friction laws side by side."
-    reason = reasons.get(result.unknown_reason, "") * bool(result.single_effect_models or not result.untried)
-    return [*text, reason, alone * bool(laws), _several_places(result)]
-
-
-def _several_places(result: DiagnosisResult) -> str:
-    """Sentence for an unknown cause: the places where the kind of the best single effect is significant, if several."""
-    scores, level = result.screening.candidate_scores, result.thresholds.gap_significance_level
-    best = [fit.effects[0].kind for fit in result.single_effect_models[:1]]
-    alike = [s for s in scores if s.p_value * len(scores) < level and s.effect.kind in best and not s.effect.is_local]
-    said = f"{''.join(best)} is significant at several locations (p below {level / max(len(scores), 1):.2g}): "
-    said += abbreviated_names_text([s.effect.location for s in alike])
-    advice = "Add it there under model.effects (friction: as `yid-ocp friction` advises), and repeat `yid-ocp diagnose`"
-    return f"{said}. {advice}." if result.unknown_reason and len(alike) > 1 else ""
+    limit = f"less than {limits.min_z:g} ± from no effect, if ± includes the gap"
+    kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
+    more = f"Leave out diagnosis.candidates, if it is set, to try more than {', '.join(kinds)}."
+    again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
+    none = _said((result.single_effect_models, tried), (result.untried, stopped), (True, tried))[0]
+    few += "".join(_said((math.isfinite(closed), end)))
+    why, advice = {
+        "": ("", ""),
+        "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),
+        "little": (f"adding {names} explains only {few}", ""),
+        "stand_in": (f"the size of {unsure} is uncertain ({limit}){apart}", again),
+    }[result.unknown_reason]
+    return f"No cause is named, because {why}.", advice
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
-    text, remedy = [], "To determine the effect, measure these parameters and fix them (parameters.NAME.free: false)."
+    rows, remedy = [], "To determine the effect, measure these parameters and fix them (parameters.NAME.free: false)."
     for fit in result.single_effect_models:
-        if not isinstance(fit, RefittedModel) or fit.evaluation.jacobian is None:
+        assert isinstance(fit, RefittedModel)
+        if fit.evaluation.jacobian is None:
             continue
-        names, rows, own = fit.problem.unknown_names, fit.problem.residual_rows, fit.effects[-1]
-        data, priors = (fit.evaluation.jacobian[part] for part in (rows.data, rows.stated_priors))
-        others: dict[str, None] = {}
-        for name in own.amplitude_parameter_names:
-            by = mask_of_priors_determining_unknown(data, priors, names.index(name))
-            others |= dict.fromkeys(names[i] for i in np.flatnonzero(by) if names[i] in fit.problem.shared_parameters)
-        text.append(_listed(f"These recordings cannot separate {own.label} from ", others, f". {remedy}"))
-    return text
+        at, own = fit.problem.residual_rows, fit.effects[-1]
+        data, priors = (fit.evaluation.jacobian[part] for part in (at.data, at.stated_priors))
+        names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
+        by = [mask_of_priors_determining_unknown(data, priors, names.index(n)) for n in own.amplitude_parameter_names]
+        others = [*dict.fromkeys(names[i] for mask in by for i in np.flatnonzero(mask[:shared]))]
+        rows.append((others, f"These recordings cannot separate {own.label} from {listed(others)}. {remedy}"))
+    return _said(*rows)
 
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
-    values, odd, is_unsure = [], "", not fit.determines_size(effect, limits.min_z)
+    values, odd = [], []
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
-        known = f"= {value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
-        values.append(f"{name} {known if math.isfinite(r.std) else '= unknown'}")
-    for name in fit.implausible_parameters(effect, limits):
+        known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
+        values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
+    for name in fit.implausible_parameters(effect, limits)[-1:]:
         low, high = effect.prior_ranges[name]
-        odd = f" (far outside its expected range, {low:.3g} to {high:.3g}, so possibly a substitute for another cause)"
-    return f"  {effect.label}: {', '.join(values)}{odd}{' (these recordings do not determine its size)' * is_unsure}"
+        where = f"its expected range, {low:.3g} to {high:.3g}"
+        odd.append(f" (far outside {where}, so possibly a substitute for another cause)")
+    unsure = _said((not fit.determines_size(effect, limits.min_z), " (these recordings do not determine its size)"))
+    return "".join([f"  {effect.label}: {', '.join(values)}", *odd, *unsure])
 
 
 def _remains(result: DiagnosisResult) -> list[str]:
@@ -268,65 +299,71 @@ def _remains(result: DiagnosisResult) -> list[str]:
     noise = {own.channel: own.noise_rmse for own in result.noise_floor}
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
-    sizes = ((x, name, unit) if unit != "m" else (1e6 * x, name, "mm") for x, name, unit in beyond)
-    worst = {unit: f"{math.sqrt(square):.2g} {unit} at {name}" for square, name, unit in sizes}
-    effects, places = result.accepted_effects, [own.location for own in result.remaining_gap_locations]
-    mostly = f". Most of this error comes from {places[0]}" if effects and places else ""
-    who = "the model with the effects" if effects else "the nominal model"
-    now = f". Its chi2 per degree of freedom there is {_short(result.remaining_test.chi2_per_dof)}" * bool(effects)
-    said = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}{now}."
-    if result.remaining_test.p_value < result.thresholds.significance_level:
-        size = f"{', '.join(worst.values())} (rms, noise subtracted)"
-        said = f"On held-out motions, the error of {who} is {size}{now}{mostly}."
-    changes = sorted(result.nominal_parameters_before_and_after.items(), key=lambda own: -_relative_change(own[1]))
-    moved = [
-        f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
-        for name, own in changes
-        if _relative_change(own) > _MIN_RELATIVE_CHANGE
-    ]
-    return [said, _listed("With the effects in the model, these estimates change: ", moved, max_entries=_MAX_NAMED)]
-
-
-def _relative_change(own: Mapping[str, Any]) -> float:
-    return float(abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9))
+    shown = {"m": (1e3, "mm")}
+    sizes = ((*shown.get(unit, (1.0, unit)), math.sqrt(square), name) for square, name, unit in beyond)
+    worst = {unit: f"{factor * size:.2g} {unit} at {name}" for factor, unit, size, name in sizes}
+    effects, places = result.accepted_effects, [own.location for own in result.remaining_gap_locations[:1]]
+    who = _said((effects, "the model with the effects"), (True, "the nominal model"))[0]
+    is_left = result.remaining_test.p_value < result.thresholds.significance_level
+    noisy = f"On held-out motions, noise and the uncertainty of the parameters explain the whole error of {who}."
+    large = f"On held-out motions, the error of {who} is {', '.join(worst.values())} (rms, noise subtracted)."
+    size = f"Its chi2 per degree of freedom there is {_short(result.remaining_test.chi2_per_dof)}."
+    mostly = f"Most of this error comes from {''.join(places)}."
+    said = _said((is_left, large), (not is_left, noisy), (effects, size), (is_left and effects and places, mostly))
+    changes = list[tuple[float, str]]()
+    for name, own in result.nominal_parameters_before_and_after.items():
+        text = f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
+        changes.append((abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9), text))
+    ranked = sorted(changes, key=lambda own: -own[0])
+    moved = listed([text for change, text in ranked if change > _MIN_RELATIVE_CHANGE], max_entries=_MAX_NAMED)
+    return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]
 
 
 def _earlier_runs(result: DiagnosisResult) -> list[str]:
-    """Sentences on changes since the baseline, and on recordings made without the effects, and with them."""
-    since, swapped, text = result.baseline_comparison, result.counterfactual, list[str]()
-    if since is not None:
-        moved = []
-        for own in since.significant_parameter_shifts:
-            before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
-            now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
-            moved.append(f"{own.name} from {before} to {now} {own.unit}")
-        changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
-        same = "No parameter differs significantly from the baseline (the earlier runs)."
-        rivals = result.confusable_parameter_changes
-        end = ". If nothing was altered on purpose, find the cause before you use the values."
-        text.append(_listed(changed, moved, end) or same * (not rivals))
-        text.append(_listed("A change of ", rivals, " since the baseline explains about as much as the effects."))
-        p = since.between_runs_p_value
-        differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
-        small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-        text += [f"{differ} The ± of the baseline includes this." * (p < _RUNS_DIFFER_LEVEL)]
-        text += [small * (not since.is_baseline_explained)]
-    parts = {} if swapped is None else {"without": swapped.effects_removed, "with": swapped.effects_added}
-    other = {} if swapped is None else swapped.effects_added.rmse_by_unit
-    for how, part in parts.items():
-        names = abbreviated_names_text([name.removesuffix(" (without)") for name in part.recordings])
+    """Sentences on changes since the baseline."""
+    since, rivals, moved = result.baseline_comparison, result.confusable_parameter_changes, list[str]()
+    if since is None:
+        return []
+    for own in since.significant_parameter_shifts:
+        before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
+        now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
+        moved.append(f"{own.name} from {before} to {now} {own.unit}")
+    changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
+    changed += f"{listed(moved)}. If nothing was altered on purpose, find the cause before you use the values."
+    p = since.between_runs_p_value
+    differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
+    small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
+    return _said(
+        (moved, changed),
+        (not [*moved, *rivals], "No parameter differs significantly from the baseline (the earlier runs)."),
+        (rivals, f"A change of {listed(rivals)} since the baseline explains about as much as the effects."),
+        (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
+        (not since.is_baseline_explained, small),
+    )
+
+
+def _counterfactual(swapped: CounterfactualPredictionErrors | None) -> list[str]:
+    """Sentences on predictions of recordings made without the effects, and of those with them."""
+    if swapped is None:
+        return []
+    text, other = list[str](), swapped.effects_added.rmse_by_unit
+    for how, part in (("without", swapped.effects_removed), ("with", swapped.effects_added)):
+        errors, names = part.rmse_by_unit, listed([name.removesuffix(" (without)") for name in part.recordings])
+        plain, then = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in errors.items()) for i in (0, 1))
         made = f"Recordings made {how} the effects ({names})"
-        plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
-        if part.failure_message:
-            text.append(f"{made} could not be predicted ({part.failure_message}), so they do not test the effects.")
-            continue
-        errors = f"{errors} (rms) by the model {how} the effects, and of {plain} by the model before the diagnosis"
-        text.append(f"{made} are predicted with an error of {errors}.")
-        ratios = [min(pair) / max(other[u]) for u, pair in part.rmse_by_unit.items() if u in other]
-        if how == "without" and min(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO:
-            worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
-            text.append(f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup.")
-        elif not part.is_improved_by_counterfactual:
-            same = " and ".join(unit for unit, (first, then) in part.rmse_by_unit.items() if then > 0.999 * first)
-            text.append(f"The diagnosis does not lower the error in {same} on {names}, so it may be wrong.")
+        failed = f"{made} could not be predicted ({part.failure_message}), so they do not test the effects."
+        found = f"{made} are predicted with an error of {then} (rms) by the model {how} the effects, and of {plain} by "
+        found += "the model before the diagnosis."
+        # at most 1 for the recordings with the effects
+        ratios = [min(errors[unit]) / max(other[unit]) for unit in errors.keys() & other]
+        worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
+        faulty = f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup."
+        same = " and ".join(unit for unit, (before, after) in errors.items() if after > 0.999 * before)
+        wrong = f"The diagnosis does not lower the error in {same} on {names}, so it may be wrong."
+        text += _said(
+            (part.failure_message, failed),
+            (max(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO, f"{found}\n{faulty}"),
+            (not part.is_improved_by_counterfactual, f"{found}\n{wrong}"),
+            (True, found),
+        )[:1]
     return text

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect, select_effects
+from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
@@ -104,17 +102,12 @@ class Judgement:
     @property
     def closure_by_selected_effects(self) -> HeldOutGapClosure:
         """The fraction of the gap that all selected effects close together. Undefined without effects."""
-        return select.total_gap_closure(self.selected_effects)
+        return total_gap_closure(self.selected_effects)
 
     @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
-
-    def with_confusable_parameter_changes(self, names: Sequence[str], distance: float) -> Judgement:
-        """Return this judgement if changes explain as much, at a distance as in `select.relative_probability`."""
-        rivals, probability = tuple(names), self.probability * select.relative_probability(distance)
-        return replace(self, verdict="confusable", confusable_parameter_changes=rivals, probability=probability)
 
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
         """Both estimates, as texts, of the effects within `min_z` stds (which include the gap) of neutral, by label."""
