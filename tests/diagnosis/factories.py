@@ -14,7 +14,7 @@ from made_series import seeing
 
 from yid_ocp.diagnosis import screening as module
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
+from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateDetectability,
     ConfusabilityMatrix,
@@ -23,11 +23,11 @@ from yid_ocp.diagnosis.screening import (
     ScreeningResult,
     _EffectSignature,
 )
-from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect
+from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
-from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
+from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, HeldOutGapClosure, HeldOutLoss, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedDisturbances, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters

@@ -13,10 +13,10 @@ from factories import alike, amplitude, cases, effect, fit, loss, score, screeni
 from heard import Heard
 
 from yid_ocp.diagnosis import select
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefitStatistics
+from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
-from yid_ocp.diagnosis.select import chi2_per_sample_decrease_and_std_error, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.inference.null_test import HeldOutLoss, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
 
 LIMITS = Thresholds()
 
@@ -188,7 +188,7 @@ def one_round(nominal, fits, screened=None, **limits):
         patch.setattr(select, "refit_with_each_effect", lambda _, base, chosen, start: tried.extend(chosen) or fits)
         search = Mock(thresholds=Thresholds(max_effects=1, **limits))
         seen = screened or screening([score(found.effects[-1]) for found in fits])
-        return [entry.effect for entry in select_effects(search, nominal, seen)[1]], tried
+        return [entry.effect for entry in select.select_effects(search, nominal, seen)[1]], tried
 
 
 def shortlisted(scores, table, **limits):
@@ -277,7 +277,7 @@ class Rounds:
         self.thresholds, self.is_late = Thresholds(**limits), is_late
         problem = SimpleNamespace(has_process_noise=self.noisy)
         nominal = fit((), loss(*self.losses[""]), self.cost, {"k": 0.0}, problem=problem)
-        first, added = select_effects(self, nominal, self.screened(), moved=moved)
+        first, added = select.select_effects(self, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 

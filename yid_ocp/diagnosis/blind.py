@@ -18,10 +18,10 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, linearize_candidates
-from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
 from yid_ocp.errors import ConfigError, DataError, ModelError, YidError
+from yid_ocp.inference.null_test import held_out_gap_closure
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.recorded_inputs import select_path_cutoff

@@ -12,7 +12,7 @@ from yid_ocp.diagnosis.gap_law import NonparametricLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import ScoreTestResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, bic_difference, held_out_gap_closure, total_gap_closure
+from yid_ocp.diagnosis.select import bic_difference, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
 from yid_ocp.display import ReprMixin, ReprTexts
@@ -171,7 +171,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     """All candidates: accepted effects, then other refits by held-out loss, then the rest by score."""
     added, alone = judged.accepted_selected_effects, judged.single_effect_models
     before, last = seen.nominal_model.held_out_loss, [entry.refitted_model for entry in added[-1:]]
-    closures = {fit.effects[0].label: held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
+    closures = {fit.effects[0].label: null_test.held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     probabilities = judged.selected_effect_and_equivalent_probabilities
     found = [
@@ -187,7 +187,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},
             **attributes_to_dict(score, "score=lm_statistic p_value"),
             "probability": probabilities.get(effect.label, 0.0),
-            **closures.get(effect.label, UNDEFINED_GAP_CLOSURE).to_dict(),
+            **closures.get(effect.label, null_test.UNDEFINED_GAP_CLOSURE).to_dict(),
         }
         listed.setdefault(effect.label, to_json_types(entry))
     return list(listed.values())

@@ -13,8 +13,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import KEPT_HELD_OUT_FRACTIONS, AllCandidatesProblem
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.select import HeldOutGapClosure, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
+from yid_ocp.diagnosis.refit import RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.law import (
     TORQUE_LAW_QUANTITY_UNITS,
@@ -25,6 +24,7 @@ from yid_ocp.effects.law import (
     torque_law_quantity_at_midpoints,
 )
 from yid_ocp.files import to_json_types
+from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -49,7 +49,7 @@ class NonparametricLaw:
     location: str
     tables: tuple[TorqueLawTable, ...]  # one table per quantity
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
-    closure: HeldOutGapClosure  # closure of the held-out gap of the model without the law
+    closure: null_test.HeldOutGapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the second best law
     model: RefittedModel  # the fitted model with the law
     has_accepted_effects: bool  # whether the model also has accepted effects
@@ -138,7 +138,7 @@ def find_gap_law(
     best, *others = found
     runner_up = None
     if others:
-        rival, closed = others[0].law, held_out_gap_closure(before.held_out_loss, others[0].loss)
+        rival, closed = others[0].law, null_test.held_out_gap_closure(before.held_out_loss, others[0].loss)
         runner_up = (rival.location, "+".join(rival.quantities), closed.fraction)
     # the model without the law may move far beyond the recorded range: new knots for the visited range
     visited = {quantity: _visited_range(best.fit, best.law.location, quantity) for quantity in best.law.quantities}
@@ -148,9 +148,9 @@ def find_gap_law(
         again, better = _refitted_families(search, problem, last, [finer], events, best.law.quantities)
         if again is not None and better and better[0].loss.chi2_per_sample <= best.loss.chi2_per_sample:
             best = better[0]
-    closure = held_out_gap_closure(before.held_out_loss, best.loss)
+    closure = null_test.held_out_gap_closure(before.held_out_loss, best.loss)
     least = _MIN_LEFTOVER_CLOSURE if last.effects else _MIN_CLOSURE
-    gained, error = chi2_per_sample_decrease_and_std_error(before.held_out_loss, best.loss)
+    gained, error = null_test.chi2_per_sample_decrease_and_std_error(before.held_out_loss, best.loss)
     if not (gained > error and closure.ci_low > least):
         return None
     ranges = {name: _visited_range(best.fit, best.law.location, name) for name in best.law.quantities}
@@ -166,7 +166,7 @@ def find_gap_law(
 class _RefittedLaw:
     law: TorqueLaw
     fit: RefittedModel
-    loss: HeldOutLoss  # of `fit`, without the chi2 of the law's prior
+    loss: null_test.HeldOutLoss  # of `fit`, without the chi2 of the law's prior
 
 
 def _refitted_families(
@@ -202,7 +202,7 @@ def _is_simplest_of_the_best(entry: _RefittedLaw, found: Sequence[_RefittedLaw],
     """Return whether a refit predicts about as well as the best (the first), with the fewest quantities of such."""
 
     def is_as_good(own: _RefittedLaw) -> bool:
-        gained, error = chi2_per_sample_decrease_and_std_error(own.loss, found[0].loss)
+        gained, error = null_test.chi2_per_sample_decrease_and_std_error(own.loss, found[0].loss)
         return gained <= max(2 * error, slack)
 
     fewest = min(len(own.law.quantities) for own in found if is_as_good(own))

@@ -1,7 +1,6 @@
 """Refits of the nominal parameters together with effects, and their errors on held-out recordings.
 
-A loss is the mean square of whitened residuals in blocks of held-out time. All models use the same blocks, so that
-differences between models are paired. G = max(0, chi2/n - 1) is the gap.
+All models use the same blocks of held-out time, so that differences between their losses are paired.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.display import PartsDoneCounter, Progress, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.inference import whitening
-from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start, whiten_with_extra_errors
+from yid_ocp.inference import null_test, whitening
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
@@ -76,44 +74,12 @@ class NominalSolutionAndRefitStore:
 
 
 @dataclass(frozen=True)
-class HeldOutLoss:
-    """The whitened squared prediction errors of a model, summed in nb time blocks of held-out data, shape (nb,)."""
-
-    block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
-    block_sample_counts: Array
-    channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
-    updated_chi2: float  # what the blocks add to chi2 if all parameters are fitted to them, too
-    # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
-    baseline_chi2: float = 0.0
-
-    @property
-    def total_chi2(self) -> float:
-        """The sum of chi2 over all held-out time blocks, plus chi2 of the deviation from earlier runs."""
-        return float(self.block_chi2.sum()) + self.baseline_chi2
-
-    @property
-    def added_joint_fit_chi2(self) -> float:
-        """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
-        return self.updated_chi2 + self.baseline_chi2
-
-    @property
-    def chi2_per_sample(self) -> float:
-        """The value of `total_chi2` divided by the number of held-out samples. Noise alone gives 1 on average."""
-        return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
-
-    @property
-    def excess_chi2_per_sample(self) -> float:
-        """The gap on held-out recordings, G = max(0, chi2/n - 1)."""
-        return max(0.0, self.chi2_per_sample - 1.0)
-
-
-@dataclass(frozen=True)
 class RefitStatistics(StoredFit):
     """The result of a refit without its estimation problem: effects, estimates, cost and held-out errors."""
 
     effects: tuple[EffectBase, ...]
     cost: float
-    held_out_loss: HeldOutLoss
+    held_out_loss: null_test.HeldOutLoss
     residual_count: int  # number of residuals of the estimation recordings, priors included
     has_process_noise: bool  # whether errors of torques drive the motion
 
@@ -293,7 +259,7 @@ def refit_with_effects(
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
     runs = [_attempt(problem, effects, start)]
     _, _, end = runs[0]
-    if not (end.ok and chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
+    if not (end.ok and null_test.chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
         # earlier effects were already tried from both starts
         moved = filter(None, (effect.alternative_start(start) for effect in effects[-1:]))
         runs += [_attempt(problem, effects, {**start, **values}) for values in moved]
@@ -397,7 +363,7 @@ def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Arr
         rows = factor[sized] - factor[sized] @ others @ others.T
         scale = np.linalg.norm(rows, axis=1)
         whitened = np.linalg.lstsq(rows / scale[:, None], away / scale, rcond=None)[0]
-        found[effect.label] = chi2_p_value(float(whitened @ whitened), len(sized))
+        found[effect.label] = null_test.chi2_p_value(float(whitened @ whitened), len(sized))
     return found
 
 
@@ -451,7 +417,7 @@ def held_out_loss(
     evaluation: Evaluation,
     spread: Array | None = None,
     predicted: Sequence[EpisodeAndPredictionOrFailure] = (),
-) -> HeldOutLoss:
+) -> null_test.HeldOutLoss:
     """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
 
     `spread` (n, k) is from `AllCandidatesProblem`. `predicted` are predictions with derivatives, if they are known.
@@ -463,7 +429,7 @@ def held_out_loss(
     for (episode, result), whitener in zip(found, problem.held_out_whitening_filters, strict=True):
         blocks = []
         for samples in episode.measurements:
-            used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
+            used, times = samples.positive_weight_mask, null_test.times_since_recording_start(episode, samples)
             blocks.append(np.broadcast_to(np.trunc(times / length).T, used.T.shape).T[used])
         own, block = np.unique(np.concatenate(blocks), return_inverse=True)
         numbered.append(count + block)
@@ -476,7 +442,8 @@ def held_out_loss(
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 
     def whitened(beside: Array) -> Array:
-        return np.nan_to_num(whiten_with_extra_errors(whole, beside), nan=np.inf, posinf=np.inf, neginf=np.inf)
+        made = null_test.whiten_with_extra_errors(whole, beside)
+        return np.nan_to_num(made, nan=np.inf, posinf=np.inf, neginf=np.inf)
 
     updated = float(np.sum(whitened(np.vstack(errors)) ** 2))
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
@@ -489,7 +456,7 @@ def held_out_loss(
     contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
     channels = held_out_rmse_and_unit_by_channel(found)
     squares = np.bincount(number, weights=whole**2).astype(float)
-    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
+    return null_test.HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
 
 
 def held_out_rmse_and_unit_by_channel(found: Sequence[EpisodeAndPredictionOrFailure]) -> dict[str, tuple[float, str]]:

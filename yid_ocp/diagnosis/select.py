@@ -1,8 +1,4 @@
-"""Selection of the effects that predict held-out recordings best, and of effects that look the same in the recordings.
-
-The closure is 1 - G_after/G_before of the held-out losses. Its interval comes from resampling blocks (Kuensch 1989,
-doi:10.1214/aos/1176347265).
-"""
+"""Selection of the effects that predict held-out recordings best, and of those that look the same in them."""
 
 from __future__ import annotations
 
@@ -13,10 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import EffectsWithStart, HeldOutLoss, RefitContext, RefitStatistics, refit_with_each_effect
+from yid_ocp.diagnosis.refit import EffectsWithStart, RefitContext, RefitStatistics, refit_with_each_effect
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
+from yid_ocp.inference import null_test
 
 _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' refits
 # of what effects explain: a model's response to them errs by 5 %, as links and time step are finite, and leaves this
@@ -25,31 +22,9 @@ _LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
 _MIN_FURTHER_PART = 0.4  # of the gap that other effects leave, to be explained by a further one
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
-_N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 _Rivals = dict[str, Sequence[tuple[EffectBase, float]]]
 """The effects that the recordings cannot distinguish from a chosen one, by its label, with their distances."""
-
-
-@dataclass(frozen=True)
-class HeldOutGapClosure:
-    """The fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
-
-    fraction: float
-    ci_low: float
-    ci_high: float
-
-    @property
-    def text(self) -> str:
-        """A text that states the closed fraction; empty if there is no gap."""
-        return f"{100 * self.fraction:.3g} % of the held-out gap closed" if math.isfinite(self.fraction) else ""
-
-    def to_dict(self) -> dict[str, float | list[float]]:
-        """Convert the closed fraction and its interval to entries of result.json."""
-        return {"closure": self.fraction, "closure_ci": [self.ci_low, self.ci_high]}
-
-
-UNDEFINED_GAP_CLOSURE = HeldOutGapClosure(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -58,46 +33,21 @@ class SelectedEffect:
 
     effect: EffectBase
     refitted_model: RefitStatistics  # refit with all effects up to this one
-    cumulative_closure: HeldOutGapClosure  # closure of the whole gap by all effects up to this one
+    cumulative_closure: null_test.HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
     # by effect parameter: std of what further effects, in the gap that is left, may contribute to its value
     model_error_std: dict[str, float] = field(default_factory=dict)
 
 
-def total_gap_closure(entries: Sequence[SelectedEffect]) -> HeldOutGapClosure:
+def total_gap_closure(entries: Sequence[SelectedEffect]) -> null_test.HeldOutGapClosure:
     """Return the fraction of the gap that all effects close together, that of the last one. Undefined without any."""
-    return next((entry.cumulative_closure for entry in reversed(entries)), UNDEFINED_GAP_CLOSURE)
-
-
-def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> HeldOutGapClosure:
-    """Compute the fraction of the held-out gap that closes from `before` to `after`, with a bootstrap interval."""
-    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
-        return UNDEFINED_GAP_CLOSURE
-    fraction = 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
-    count = len(before.block_sample_counts)
-    draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
-    n = before.block_sample_counts[draws].sum(axis=1)
-    chi2 = (loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2 for loss in (before, after))
-    g0, g1 = (np.maximum(total / n - 1.0, 0.0) for total in chi2)
-    low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975])
-    return HeldOutGapClosure(fraction, float(low), float(high))
+    return next((entry.cumulative_closure for entry in reversed(entries)), null_test.UNDEFINED_GAP_CLOSURE)
 
 
 def _leaves_noise(fit: RefitStatistics, limits: Thresholds) -> bool:
     """Whether a fit's held-out chi2 per sample is near 1, so that its residual is mainly noise."""
     return fit.held_out_loss.chi2_per_sample < 1 + limits.min_excess_chi2_per_dof
-
-
-def chi2_per_sample_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
-    """Compute the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
-    total = float(before.block_sample_counts.sum())
-    difference = before.block_chi2 - after.block_chi2
-    if not np.all(np.isfinite(difference)):
-        return before.chi2_per_sample - after.chi2_per_sample, 0.0
-    count = len(difference)
-    error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
-    return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
 def bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int = 0) -> float:
@@ -160,7 +110,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
     The larger of both counts, because a few large blocks dominate the error of the sum.
     """
     loss, best = fit.held_out_loss, other.held_out_loss
-    lost, error = chi2_per_sample_decrease_and_std_error(loss, best)
+    lost, error = null_test.chi2_per_sample_decrease_and_std_error(loss, best)
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
     spread = float(np.std(ratios, ddof=1)) / math.sqrt(len(ratios))
     return max(lost / max(error, _LOSS_RTOL * best.chi2_per_sample), float(ratios.mean()) / max(spread, _LOSS_RTOL))
@@ -172,7 +122,7 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     Beside other effects, they must also explain a good part of what is left. Less may be errors of the others.
     """
     before, after = without.held_out_loss, fit.held_out_loss
-    gained, error = chi2_per_sample_decrease_and_std_error(before, after)
+    gained, error = null_test.chi2_per_sample_decrease_and_std_error(before, after)
     part_of_fitted = 2 * (without.cost - fit.cost) / max(without.excess_chi2, 1.0)
     part = max(part_of_fitted, gained / max(before.excess_chi2_per_sample, 1e-9))
     is_clear = gained > error and part > _MIN_FURTHER_PART * bool(without.effects)
@@ -235,7 +185,7 @@ def select_effects(
         before, chosen = chosen, better
         base = better.effects
         beside = join_effect_labels(base)
-        closed = held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
+        closed = null_test.held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
         is_full = len(base) >= limits.max_effects
@@ -262,7 +212,7 @@ def select_effects(
     for i, effect in enumerate(chosen.effects, 1):
         name = join_effect_labels(chosen.effects[:i])
         fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
-        closed = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
+        closed = null_test.held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
         added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
     return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)

@@ -8,10 +8,10 @@ from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
-from yid_ocp.diagnosis.select import HeldOutGapClosure, SelectedEffect, select_effects, total_gap_closure
+from yid_ocp.diagnosis.select import SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
+from yid_ocp.inference.null_test import HeldOutGapClosure, NullTestResult, residuals_exceed_noise
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 _UnknownVerdictReason = Literal["", "none", "little", "stand_in"]

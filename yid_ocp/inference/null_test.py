@@ -1,4 +1,4 @@
-"""Null test, which decides whether noise alone explains a residual.
+"""Null test, which decides whether noise alone explains a residual, and the part of a gap that another model closes.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
 (white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2). A chi-squared variable
@@ -27,6 +27,7 @@ from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIF
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
+_N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
@@ -213,6 +214,88 @@ def residuals_exceed_noise(
 def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> float:
     """Return the smallest p-value of several tests after Bonferroni correction."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
+
+
+@dataclass(frozen=True)
+class HeldOutLoss:
+    """The whitened squared prediction errors of a model, summed in nb time blocks of held-out data, shape (nb,)."""
+
+    block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
+    block_sample_counts: Array
+    channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
+    updated_chi2: float  # what the blocks add to chi2 if all parameters are fitted to them, too
+    # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
+    baseline_chi2: float = 0.0
+
+    @property
+    def total_chi2(self) -> float:
+        """The sum of chi2 over all held-out time blocks, plus chi2 of the deviation from earlier runs."""
+        return float(self.block_chi2.sum()) + self.baseline_chi2
+
+    @property
+    def added_joint_fit_chi2(self) -> float:
+        """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
+        return self.updated_chi2 + self.baseline_chi2
+
+    @property
+    def chi2_per_sample(self) -> float:
+        """The value of `total_chi2` divided by the number of held-out samples. Noise alone gives 1 on average."""
+        return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
+
+    @property
+    def excess_chi2_per_sample(self) -> float:
+        """The gap on held-out recordings, G = max(0, chi2/n - 1)."""
+        return max(0.0, self.chi2_per_sample - 1.0)
+
+
+@dataclass(frozen=True)
+class HeldOutGapClosure:
+    """The fraction of the held-out gap that a model closes, with its 95 % interval. NaN if there is no gap."""
+
+    fraction: float
+    ci_low: float
+    ci_high: float
+
+    @property
+    def text(self) -> str:
+        """A text that states the closed fraction; empty if there is no gap."""
+        return f"{100 * self.fraction:.3g} % of the held-out gap closed" if math.isfinite(self.fraction) else ""
+
+    def to_dict(self) -> dict[str, float | list[float]]:
+        """Convert the closed fraction and its interval to entries of result.json."""
+        return {"closure": self.fraction, "closure_ci": [self.ci_low, self.ci_high]}
+
+
+UNDEFINED_GAP_CLOSURE = HeldOutGapClosure(math.nan, math.nan, math.nan)
+
+
+def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> HeldOutGapClosure:
+    """Compute the fraction of the gap that closes, 1 - G_after/G_before, with its interval from resampled blocks.
+
+    Kuensch 1989, doi:10.1214/aos/1176347265.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = 1 - float(np.divide(after.excess_chi2_per_sample, before.excess_chi2_per_sample))
+    if not math.isfinite(fraction):
+        return UNDEFINED_GAP_CLOSURE
+    count = len(before.block_sample_counts)
+    draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
+    n = before.block_sample_counts[draws].sum(axis=1)
+    chi2 = (loss.block_chi2[draws].sum(axis=1) + loss.baseline_chi2 for loss in (before, after))
+    g0, g1 = (np.maximum(total / n - 1.0, 0.0) for total in chi2)
+    low, high = np.quantile(1 - g1[g0 > 0] / g0[g0 > 0], [0.025, 0.975])
+    return HeldOutGapClosure(fraction, float(low), float(high))
+
+
+def chi2_per_sample_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
+    """Compute the decrease of held-out chi2/n from `before` to `after`, and its standard error over blocks."""
+    total = float(before.block_sample_counts.sum())
+    difference = before.block_chi2 - after.block_chi2
+    if not np.all(np.isfinite(difference)):
+        return before.chi2_per_sample - after.chi2_per_sample, 0.0
+    count = len(difference)
+    error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
+    return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
 def _windows(
