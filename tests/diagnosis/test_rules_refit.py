@@ -14,12 +14,12 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     StoredFit,
     _effect_p_values,
-    held_out_loss,
     refit_with_each_effect,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import SolverError
+from yid_ocp.inference.null_test import held_out_loss
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import Status
 
@@ -107,7 +107,8 @@ def solved(monkeypatch):
         return loss(1.5, 1.6)
 
     monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
-    monkeypatch.setattr(module, "held_out_loss", held_out)
+    monkeypatch.setattr(module.null_test, "held_out_loss", held_out)
+    monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
     monkeypatch.setattr(
         module, "_refit_covariance_factor", lambda problem, finish, limits: 0.1 * np.eye(len(problem.unknown_names))
     )
@@ -321,17 +322,16 @@ def predicting(monkeypatch):
         told["episodes"] = [e.name for e in episodes]
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}} if results else {}
 
-    monkeypatch.setattr(module, "rmse_unit_count_dicts_by_channel", channel_errors)
+    monkeypatch.setattr("yid_ocp.problem.predictions.rmse_unit_count_dicts_by_channel", channel_errors)
 
     def rows(there, whitening, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
         residual = np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs])
         return SimpleNamespace(residual=residual, jacobian=np.full((len(residual), 2), [1.0, 7.0]))
 
-    monkeypatch.setattr(module, "episode_residual_and_jacobian", rows)
+    monkeypatch.setattr(module.null_test, "episode_residual_and_jacobian", rows)
     usual = {"has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": ("k",), "unknown_names": (), "initial_unknowns": np.zeros(0)}
-    monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
 
     def made(*pairs):
         own = {"held_out": [e for e, _ in pairs], "held_out_whitening_filters": [None] * len(pairs)}

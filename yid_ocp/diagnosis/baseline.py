@@ -17,7 +17,7 @@ import scipy.special
 from yid_ocp.analysis.run_estimates import RunEstimates, nearby_positive_definite_covariance, pool_estimates_and_chi2
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_rmse_and_unit_by_channel
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
 from yid_ocp.effects import EffectBase
@@ -28,6 +28,7 @@ from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
+from yid_ocp.problem.predictions import held_out_rmse_and_unit_by_channel
 from yid_ocp.solvers import Status
 
 _SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"

@@ -28,7 +28,6 @@ from yid_ocp.diagnosis.refit import (
     RefitContext,
     RefitStore,
     RefittedModel,
-    held_out_loss,
     reevaluate_refit_with_all_candidates,
     refit_with_effects,
 )
@@ -41,7 +40,7 @@ from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.null_test import excess_over_sample_count
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
-from yid_ocp.inference.uncertainty import null_tests_of_fit
+from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests_of_fit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
@@ -138,7 +137,8 @@ def _examined(
     own = nominal.problem
     composed = replace(search.problem, problem=own, candidate_effects=effects, held_out_spread=spread)
     composed.changes_by_encoder_noise.clear()
-    nominal = replace(nominal, held_out_loss=held_out_loss(*nominal.at_estimates, spread, predicted))
+    factor = noise_only_covariance_sqrt(own, nominal.evaluation)
+    nominal = replace(nominal, held_out_loss=null_test.held_out_loss(own, nominal.unknowns, factor, spread, predicted))
     del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT, discretisation_chi2=least)

@@ -1,7 +1,4 @@
-"""Refits of the nominal parameters together with effects, and their errors on held-out recordings.
-
-All models use the same blocks of held-out time, so that differences between their losses are paired.
-"""
+"""Refits of the nominal parameters together with effects, and their errors on held-out recordings."""
 
 from __future__ import annotations
 
@@ -25,16 +22,13 @@ from yid_ocp.inference import null_test, whitening
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
-from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation, episode_residual_and_jacobian
-from yid_ocp.problem.predictions import rmse_unit_count_dicts_by_channel
+from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
-_BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
 _MIN_LEFT_OUT_FOR_OWN_STEP = 800  # candidates, times refits, times recordings, which repay a step's compilation
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
@@ -299,7 +293,8 @@ def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
     kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
-    loss = held_out_loss(own, own.pack_unknowns(known.values), end, spread)
+    x, factor = own.pack_unknowns(known.values), noise_only_covariance_sqrt(own, end)
+    loss = null_test.held_out_loss(own, x, factor, spread)
     return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
 
 
@@ -408,59 +403,3 @@ def refit_with_each_effect(
             break
         fits += map_with_merged_calls(one, tried[i : i + size])
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]
-
-
-@np.errstate(invalid="ignore")  # of recordings that cannot be predicted
-def held_out_loss(
-    problem: EstimationProblem,
-    x: Array,
-    evaluation: Evaluation,
-    spread: Array | None = None,
-    predicted: Sequence[EpisodeAndPredictionOrFailure] = (),
-) -> null_test.HeldOutLoss:
-    """Compute the prediction loss on held-out recordings of a fit at `x`, where it has the given evaluation.
-
-    `spread` (n, k) is from `AllCandidatesProblem`. `predicted` are predictions with derivatives, if they are known.
-    """
-    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
-    length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
-    factor = noise_only_covariance_sqrt(problem, evaluation)[: len(problem.shared_parameters)]
-    found, residuals, errors, numbered, count = predicted or problem.predict_held_out(x, True), [], [], [], 0
-    for (episode, result), whitener in zip(found, problem.held_out_whitening_filters, strict=True):
-        blocks = []
-        for samples in episode.measurements:
-            used, times = samples.positive_weight_mask, null_test.times_since_recording_start(episode, samples)
-            blocks.append(np.broadcast_to(np.trunc(times / length).T, used.T.shape).T[used])
-        own, block = np.unique(np.concatenate(blocks), return_inverse=True)
-        numbered.append(count + block)
-        count += len(own)
-        residuals.append(np.full(len(block), np.inf))
-        errors.append(np.zeros((len(block), factor.shape[1])))
-        if not isinstance(result, str):
-            part = episode_residual_and_jacobian(episode, whitener, result)
-            residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
-    whole, number = np.concatenate(residuals), np.concatenate(numbered)
-
-    def whitened(beside: Array) -> Array:
-        made = null_test.whiten_with_extra_errors(whole, beside)
-        return np.nan_to_num(made, nan=np.inf, posinf=np.inf, neginf=np.inf)
-
-    updated = float(np.sum(whitened(np.vstack(errors)) ** 2))
-    if spread is not None:  # what the nominal parameters leave uncertain is no gap
-        whole = whitened(spread)
-    if problem.has_process_noise:
-        # errors in metres and radians are those of predictions from recorded torques minus offsets
-        found = whitening.problem_with_sensor_noise_only(problem).predict_held_out(x)
-    joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
-    apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
-    contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
-    channels = held_out_rmse_and_unit_by_channel(found)
-    squares = np.bincount(number, weights=whole**2).astype(float)
-    return null_test.HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
-
-
-def held_out_rmse_and_unit_by_channel(found: Sequence[EpisodeAndPredictionOrFailure]) -> dict[str, tuple[float, str]]:
-    """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
-    predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
-    errors = rmse_unit_count_dicts_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
-    return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

@@ -16,10 +16,13 @@ import scipy.linalg
 import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.inference import whitening
+from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
+from yid_ocp.problem.predictions import held_out_rmse_and_unit_by_channel
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors.base import ZeroPhaseFilterInterface
@@ -27,6 +30,7 @@ from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIF
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
+_BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
@@ -246,6 +250,56 @@ class HeldOutLoss:
     def excess_chi2_per_sample(self) -> float:
         """The gap on held-out recordings, G = max(0, chi2/n - 1)."""
         return max(0.0, self.chi2_per_sample - 1.0)
+
+
+@np.errstate(invalid="ignore")  # of recordings that cannot be predicted
+def held_out_loss(
+    problem: EstimationProblem,
+    x: Array,
+    covariance_factor: Array,
+    spread: Array | None = None,
+    predicted: Sequence[EpisodeAndPredictionOrFailure] = (),
+) -> HeldOutLoss:
+    """Compute the prediction loss on held-out recordings of a fit at `x` (nx,) whose covariance by noise is F F'.
+
+    `covariance_factor` is F (nx, nx). `spread` (n, k) has errors of the residual that are no gap, each by one standard
+    deviation. `predicted` are predictions with derivatives, if they are known.
+    """
+    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
+    length = float(np.clip(total / 40, *_BLOCK_DURATIONS))
+    factor = covariance_factor[: len(problem.shared_parameters)]
+    found, residuals, errors, numbered, count = predicted or problem.predict_held_out(x, True), [], [], [], 0
+    for (episode, result), whitener in zip(found, problem.held_out_whitening_filters, strict=True):
+        blocks = []
+        for samples in episode.measurements:
+            used, times = samples.positive_weight_mask, times_since_recording_start(episode, samples)
+            blocks.append(np.broadcast_to(np.trunc(times / length).T, used.T.shape).T[used])
+        own, block = np.unique(np.concatenate(blocks), return_inverse=True)
+        numbered.append(count + block)
+        count += len(own)
+        residuals.append(np.full(len(block), np.inf))
+        errors.append(np.zeros((len(block), factor.shape[1])))
+        if not isinstance(result, str):
+            part = episode_residual_and_jacobian(episode, whitener, result)
+            residuals[-1], errors[-1] = part.residual, np.asarray(part.jacobian)[:, : len(factor)] @ factor
+    whole, number = np.concatenate(residuals), np.concatenate(numbered)
+
+    def whitened(beside: Array) -> Array:
+        made = whiten_with_extra_errors(whole, beside)
+        return np.nan_to_num(made, nan=np.inf, posinf=np.inf, neginf=np.inf)
+
+    updated = float(np.sum(whitened(np.vstack(errors)) ** 2))
+    if spread is not None:  # what the nominal parameters leave uncertain is no gap
+        whole = whitened(spread)
+    if problem.has_process_noise:
+        # errors in metres and radians are those of predictions from recorded torques minus offsets
+        found = whitening.problem_with_sensor_noise_only(problem).predict_held_out(x)
+    joint = problem.options.multivariate_prior.restricted_to(problem.shared_parameters)
+    apart = (x - problem.initial_unknowns)[[problem.unknown_names.index(name) for name in joint.parameter_names]]
+    contradiction = float(apart @ np.linalg.solve(joint.covariance, apart))
+    channels = held_out_rmse_and_unit_by_channel(found)
+    squares = np.bincount(number, weights=whole**2).astype(float)
+    return HeldOutLoss(squares, np.bincount(number).astype(float), channels, updated, contradiction)
 
 
 @dataclass(frozen=True)

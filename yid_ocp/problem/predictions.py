@@ -15,7 +15,7 @@ from yid_ocp.errors import DataError, failed_rollout_error
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import FirstOrderLag
 from yid_ocp.sensors import joints as joint_sensors
@@ -130,6 +130,13 @@ def rmse_unit_count_dicts_by_channel(
             units[own.channel] = own.unit
     seen = ((channel, values) for channel, values in squares.items() if values)
     return {name: {"rmse": float(np.sqrt(np.mean(x))), "unit": units[name], "n": len(x)} for name, x in seen}
+
+
+def held_out_rmse_and_unit_by_channel(found: Sequence[EpisodeAndPredictionOrFailure]) -> dict[str, tuple[float, str]]:
+    """Return the root mean square error and unit of each channel over all predicted held-out recordings."""
+    predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
+    errors = rmse_unit_count_dicts_by_channel([own for own, _ in predicted], [episode for _, episode in predicted])
+    return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
 
 
 def recording_from_prediction(
