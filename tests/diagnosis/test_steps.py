@@ -136,7 +136,7 @@ def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch
     monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: problem)
     forecast, name = np.array([1.0, 1.0, 9.0, 9.0]), "predicted_refit_residual_at_finer_step"
     monkeypatch.setattr(diagnose.discretisation, name, lambda *_: forecast)
-    fit = Mock(problem=problem, evaluation=Mock(residual=np.full(4, 2.0)), at_estimates=())
+    fit = Mock(at_estimates=(problem, None, Mock(residual=np.full(4, 2.0))))
     assert diagnose._fall_at_half_time_step(Mock(), fit, None, False) == pytest.approx(8.0 - 2.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
@@ -16,7 +17,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
-from yid_ocp.inference.null_test import episodes_with_noisier_motion
+from yid_ocp.inference.null_test import episodes_with_noisier_motion, excess_over_sample_count
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, simulate, step_with_time_step
@@ -151,6 +152,23 @@ def predicted_refit_residual_at_finer_step(
     start = refined._unknowns(coarse.unknown_names, x)
     fitted = fine.evaluate(GaussNewton().minimize_cost(fine, start, None).x, False, at_x.equilibrium_guesses)
     return fitted.residual if fitted.ok and fitted.cost < before.cost else left
+
+
+def predicted_chi2_fall_at_finer_step(
+    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation, is_refitted: bool = False
+) -> float:
+    """Predict the sum of the falls of r'r - n over sensors by a shorter time step; minus infinity if this fails.
+
+    The arguments are those of `predicted_refit_residual_at_finer_step`. Only falls count: r'r of efforts may rise,
+    because the noise of accelerations in it depends on the time step.
+    """
+    left = predicted_refit_residual_at_finer_step(fine, coarse, x, at_x, is_refitted)
+    if left is None:
+        return -math.inf
+    rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (coarse, fine))
+    pairs = zip((at_x.residual, left), rows, strict=True)
+    before, after = ([excess_over_sample_count(r[at]) for at in part] for r, part in pairs)
+    return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
 def stds_with_time_step_and_encoder_errors(

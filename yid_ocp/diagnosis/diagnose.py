@@ -38,7 +38,6 @@ from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
-from yid_ocp.inference.null_test import excess_over_sample_count
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests_of_fit
 from yid_ocp.problem import EstimationProblem
@@ -252,17 +251,9 @@ def _with_changed_parameters(
 
 
 def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet, is_refitted: bool) -> float:
-    """Sum of the falls of r'r - n over sensors by half the time step; minus infinity if motions cannot be predicted."""
     search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
     fine = _at_finer_step(search, fit, events)
-    left = discretisation.predicted_refit_residual_at_finer_step(fine, *fit.at_estimates, is_refitted)
-    if left is None:
-        return -math.inf
-    # only falls count: r'r of efforts may rise, because the noise of accelerations in it depends on the time step
-    rows = (itertools.chain.from_iterable(own.residual_rows.measurements) for own in (fit.problem, fine))
-    pairs = zip((fit.evaluation.residual, left), rows, strict=True)
-    before, after = ([excess_over_sample_count(r[at]) for at in part] for r, part in pairs)
-    return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
+    return discretisation.predicted_chi2_fall_at_finer_step(fine, *fit.at_estimates, is_refitted)
 
 
 def _at_finer_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> EstimationProblem:

@@ -1,18 +1,13 @@
 """Screening of all candidates: detectability and score tests from one computation of sensitivities.
 
 r is the whitened residual of the nominal fit, J_theta its sensitivity to the parameters of the nominal fit, J_j that to
-the amplitudes of candidate j, and P = I - J_theta J_theta^+:
-
-    G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
-
-S_j = G_j for white noise of unit standard deviation. Encoders' noise that moves prescribed arms adds E_j E_j', where
-E_j = J_j' P e for draws e of what it does to the residual. In efforts it changes sensitivity and residual together,
-which biases s_j by -E[dJ_j' P dr] (errors in variables). Further draws of it give the bias, which is subtracted (Cook
-and Stefanski 1994, doi:10.1080/01621459.1994.10476871). For autocorrelated noise, S_j is the sum of the scores'
-autocovariances after the candidate's step (Bartlett weights, Newey and West 1987, doi:10.2307/1913610). The linear
-model predicts a decrease of r'r by s_j' G_j^-1 s_j, or less if an amplitude would leave its bounds. Shape parameters
-are tried on a grid, and the best p-value is corrected for that many trials (Davies 1987, doi:10.1093/biomet/74.1.33,
-bounded by Bonferroni).
+the amplitudes of candidate j, and P = I - J_theta J_theta^+. The score is s_j = -J_j' P r, its information
+G_j = J_j' P J_j, its statistic LM_j = s_j' S_j^-1 s_j. S_j, the covariance of s_j, has the noise's autocorrelation
+(Newey and West 1987, doi:10.2307/1913610) and the noise of encoders; the bias by the latter is subtracted (Cook and
+Stefanski 1994, doi:10.1080/01621459.1994.10476871). The linear model predicts a decrease of r'r by s_j' G_j^-1 s_j, or
+less if an amplitude would leave its bounds. Shape parameters are tried on a grid, and the best p-value is corrected for
+that many trials (Davies 1987, doi:10.1093/biomet/74.1.33, bounded by Bonferroni). `docs/design/screening_and_refits.md`
+has the derivation.
 """
 
 from __future__ import annotations

@@ -134,22 +134,17 @@ class Judgement:
             for effect, share in zip(entry.equivalent_effects, entry.shares, strict=True)
         }
 
-    def required_total_fraction(self, of_one: float) -> float:
-        """Compute the fraction of the gap that the selected effects must explain if one must explain `of_one`.
-
-        For k independent effects (every local one, every other kind) it is 1 - (1 - `of_one`)^k: each explains a part.
-        """
-        effects = (entry.effect for entry in self.selected_effects)
-        return 1.0 - (1.0 - of_one) ** len({effect.label if effect.is_local else effect.kind for effect in effects})
-
     def explained_and_required_fractions(self, limits: Thresholds) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the explained and the required fraction of the gap, of fitted r'r and of held-out errors.
 
-        One of the two must suffice. Held-out errors count at the lower end of the closure's 95 % interval.
+        One of the two must suffice. Held-out errors count at the lower end of the closure's 95 % interval. If one
+        effect must explain L, k independent ones (every local one, every other kind) must explain 1 - (1 - L)^k.
         """
+        effects = (entry.effect for entry in self.selected_effects)
+        count = len({effect.label if effect.is_local else effect.kind for effect in effects})
         closed = self.closure_by_selected_effects.ci_low
         pairs = (self.explained_fraction, limits.min_explained_fraction), (closed, limits.min_closure)
-        fitted, held_out = ((part, self.required_total_fraction(least)) for part, least in pairs)
+        fitted, held_out = ((part, 1.0 - (1.0 - least) ** count) for part, least in pairs)
         return fitted, held_out
 
 
