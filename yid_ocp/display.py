@@ -52,6 +52,11 @@ def count_with_noun(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def texts_that_hold(*rows: tuple[object, str]) -> list[str]:
+    """Return the texts whose condition holds, or is not empty."""
+    return [text for holds, text in rows if holds]
+
+
 def p_value_text(p_value: float, relation: str = "") -> str:
     """Format a p-value after a `relation`, such as "= ". Values below 1e-12 give `< 1e-12`."""
     return f"{relation}{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"

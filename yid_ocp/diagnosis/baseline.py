@@ -19,12 +19,14 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, texts_that_hold
+from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, failed_rollout_error, nearest_name_question
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.inference.null_test import chi2_p_value
+from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.inference.whitening import problem_with_sensor_noise_only
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
@@ -34,6 +36,8 @@ from yid_ocp.solvers import Status
 _SHIFT = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
 _SHIFT += " changed=has_changed"
 _MIN_RMSE_CHANGE = 1e-3  # relative change of an RMSE, below which it counts as equal
+_FAULTY_RECORDING_ERROR_RATIO = 3  # error on a reference recording by any model, over that on the other recordings
+_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _MIN_INFORMED_FRACTION = 0.05  # relative fall of a prior's variance, below which the data do not inform a parameter
 
 
@@ -67,6 +71,26 @@ class ParameterShiftsSinceBaseline:
     def to_dict(self) -> dict[str, Any]:
         """Convert the parameter changes to a dictionary, the entry `baseline` of `yid-diagnosis/2`."""
         return {"parameters": {entry.name: attributes_to_dict(entry, _SHIFT) for entry in self.parameter_shifts}}
+
+    def sentences(self, rivals: Sequence[str]) -> list[str]:
+        """Return sentences on the changes. Changes of the parameters `rivals` explain as much as effects."""
+        moved = list[str]()
+        for own in self.significant_parameter_shifts:
+            before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
+            now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
+            moved.append(f"{own.name} from {before} to {now} {own.unit}")
+        changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
+        changed += f"{listed(moved)}. If nothing was altered on purpose, find the cause before you use the values."
+        p = self.between_runs_p_value
+        differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
+        small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
+        return texts_that_hold(
+            (moved, changed),
+            (not [*moved, *rivals], "No parameter differs significantly from the baseline (the earlier runs)."),
+            (rivals, f"A change of {listed(rivals)} since the baseline explains about as much as the effects."),
+            (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
+            (not self.is_baseline_explained, small),
+        )
 
 
 def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
@@ -241,6 +265,32 @@ class CounterfactualPredictionErrors:
     def to_dict(self) -> dict[str, Any]:
         """Convert the prediction errors to a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
+
+    @property
+    def sentences(self) -> list[str]:
+        """The sentences on predictions of recordings made without the effects, and of those with them."""
+        text, other = list[str](), self.effects_added.rmse_by_unit
+        for how, part in (("without", self.effects_removed), ("with", self.effects_added)):
+            errors, recordings = part.rmse_by_unit, (name.removesuffix(" (without)") for name in part.recordings)
+            names = listed([*recordings])
+            plain, then = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in errors.items()) for i in (0, 1))
+            made = f"Recordings made {how} the effects ({names})"
+            failed = f"{made} could not be predicted ({part.failure_message}), so they do not test the effects."
+            found = f"{made} are predicted with an error of {then} (rms) by the model {how} the effects, and of {plain}"
+            found += " by the model before the diagnosis."
+            # at most 1 for the recordings with the effects
+            ratios = [min(errors[unit]) / max(other[unit]) for unit in errors.keys() & other]
+            worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
+            faulty = f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup."
+            same = " and ".join(unit for unit, (before, after) in errors.items() if after > 0.999 * before)
+            wrong = f"The diagnosis does not lower the error in {same} on {names}, so it may be wrong."
+            text += texts_that_hold(
+                (part.failure_message, failed),
+                (max(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO, f"{found}\n{faulty}"),
+                (not part.is_improved_by_counterfactual, f"{found}\n{wrong}"),
+                (True, found),
+            )[:1]
+        return text
 
 
 def _predicted(

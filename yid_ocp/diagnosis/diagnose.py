@@ -32,7 +32,7 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candidates_at_location, screen_candidates
-from yid_ocp.diagnosis.sentences import diagnosis_summary_text, held_out_truncation_message, recommended_experiment_text
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
@@ -300,7 +300,7 @@ def _followed(
         composed = replace(search.problem, problem=nominal.problem)
         composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, fraction)
         for cut in cuts:
-            search.progress.begin_stage(held_out_truncation_message(cut, nominal.problem.step.time_step))
+            search.progress.begin_stage(cut.sentence(nominal.problem.step.time_step))
             found[cut.recording] = cut
         search = replace(search, problem=composed)
         name = f"the nominal model, limited to the part that it can follow ({fraction:g})"

@@ -87,6 +87,12 @@ class ForceOrFaultEvent:
     unit: str
     detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
+    @property
+    def text(self) -> str:
+        """A text that states what happened in which channel, when and in which recording."""
+        what = {"force": "push of", "sample": "wrong samples of"}[self.kind]
+        return f"{what} {self.channel} at {self.start_time:.2f} to {self.end_time:.2f} s of '{self.recording}'"
+
     def _overlap(self, other: ForceOrFaultEvent) -> float:
         """Return the common time [s] of two events, each since its recording began; negative without overlap."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
@@ -116,6 +122,12 @@ class EventSet:
 
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
+
+    def overspeed_sentences(self, max_joint_speed: float) -> list[str]:
+        """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
+        why = f"then moves faster than diagnosis.max_joint_speed ({max_joint_speed:g} rad/s or m/s)."
+        cut = "s are ignored, because joint"
+        return [f"Data of '{e.recording}' after {e.start_time:.3g} {cut} {e.joint} {why}" for e in self.overspeeds]
 
     def has_same_force_and_fault_events(self, other: EventSet) -> bool:
         """Return whether both sets have equally many events, in the same channels and at overlapping times."""

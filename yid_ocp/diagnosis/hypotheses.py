@@ -121,6 +121,12 @@ class HeldOutTruncation:
     kept_duration: float  # duration that is compared with predictions [s]; 0 if the recording is left out
     full_duration: float  # duration of the whole recording [s]
 
+    def sentence(self, time_step: float) -> str:
+        """Return a sentence that states for how long the nominal model with this time step follows the recording."""
+        used = f"Only {self.kept_duration:.3g} of {self.full_duration:.3g} s of held-out recording '{self.recording}'"
+        more = f"To use more, set problem.time_step: {time_step / 2:.4g}."
+        return f"{used} are used, because its simulation then fails. {more}"
+
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:

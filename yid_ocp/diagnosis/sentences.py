@@ -6,14 +6,13 @@ import math
 
 import numpy as np
 
-from yid_ocp.diagnosis.baseline import CounterfactualPredictionErrors
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
 from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
+from yid_ocp.display import texts_that_hold as _said
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
@@ -23,8 +22,6 @@ MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_NAMED = 5  # number of named parameters, the largest changes first, and of named events
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
-_FAULTY_RECORDING_ERROR_RATIO = 3  # error on a reference recording by any model, over that on the other recordings
-_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
     "plant": "the mechanics, not a sensor",
@@ -33,11 +30,6 @@ GAP_ORIGIN_TEXTS = {
     "both": "both the mechanics and a sensor",
     "none": "neither the mechanics nor a constant error of a sensor, as far as these unknowns can show",
 }
-
-
-def _said(*rows: tuple[object, str]) -> list[str]:
-    """The texts whose condition holds, or is not empty."""
-    return [text for holds, text in rows if holds]
 
 
 def recommended_experiment_text(result: DiagnosisResult) -> str:
@@ -68,29 +60,18 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: may the model be used, is there a gap and why, what else matters, what to do."""
-    step, notes = result.stated_and_used_time_step[1], _notes(result)
+    step, since, notes = result.stated_and_used_time_step[1], result.baseline_comparison, _notes(result)
     text = [_lead(result)]
     text += {"insufficient_data": [], "no_gap": _why_no_gap(result)}.get(result.verdict, _why_gap(result))
     text += [] if result.law is None else [result.law.sentence]
-    text += [held_out_truncation_message(cut, step) for cut in result.truncated_recordings]
-    text += [*_bound_by_priors(result), *_earlier_runs(result), *_counterfactual(result.counterfactual)]
-    text += [*filter(None, (note for note, _ in notes)), *overspeed_truncation_messages(result)]
+    text += [*(cut.sentence(step) for cut in result.truncated_recordings), *_bound_by_priors(result)]
+    text += [] if since is None else since.sentences(result.confusable_parameter_changes)
+    text += [] if result.counterfactual is None else result.counterfactual.sentences
+    text += [note for note, _ in notes]
+    text += result.events.overspeed_sentences(result.thresholds.max_joint_speed)
     steps = [*filter(None, (step for _, step in notes)), result.next_experiment]
     numbered = " ".join(f"{i}. {step}" for i, step in enumerate(steps, 1))
     return "\n".join([*text, f"Do next: {_said((steps[1:], numbered), (True, steps[-1]))[0]}"])
-
-
-def held_out_truncation_message(cut: HeldOutTruncation, time_step: float) -> str:
-    """Return a sentence that states for how long the nominal model follows a truncated held-out recording."""
-    used = f"Only {cut.kept_duration:.3g} of {cut.full_duration:.3g} s of held-out recording '{cut.recording}' are used"
-    return f"{used}, because its simulation then fails. To use more, set problem.time_step: {time_step / 2:.4g}."
-
-
-def overspeed_truncation_messages(result: DiagnosisResult) -> list[str]:
-    """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
-    why = f"then moves faster than diagnosis.max_joint_speed ({result.thresholds.max_joint_speed:g} rad/s or m/s)."
-    cut, cuts = "s are ignored, because joint", result.events.overspeeds
-    return [f"Data of '{e.recording}' after {e.start_time:.3g} {cut} {e.joint} {why}" for e in cuts]
 
 
 def _short(number: float) -> str:
@@ -114,10 +95,8 @@ def _lead(result: DiagnosisResult) -> str:
     gap = _said((exceeds, large), (True, small))[0]
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
     shown = f"would show {sum(seen)} of {len(seen)} effects"
-    enough = f"(more than {unknowns}, the number of unknowns, are needed), and {shown} (at least 1 is needed)"
-    few = (
-        f"The model is not tested: the recordings have {tests[0].degrees_of_freedom:.0f} independent samples {enough}."
-    )
+    degrees = f"{tests[0].degrees_of_freedom:.0f} independent samples"
+    few = f"{degrees} (more than {unknowns}, the number of unknowns, are needed)"
     is_left = result.remaining_test.p_value < limits.significance_level
     beyond = "".join(_said((is_left, ", but expect errors beyond noise")))
     names = listed([effect.label for effect in result.accepted_effects])
@@ -126,7 +105,7 @@ def _lead(result: DiagnosisResult) -> str:
     none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
     not_yet = "Do not use the estimates yet, because several causes explain the model's error about equally well."
     return {
-        "insufficient_data": few,
+        "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
         "no_gap": none,
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
@@ -214,9 +193,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
     laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
-    what = {"force": "push of", "sample": "wrong samples of"}
-    when = [f"{e.channel} at {e.start_time:.2f} to {e.end_time:.2f} s of '{e.recording}'" for e in events]
-    told = listed([f"{what[e.kind]} {own}" for e, own in zip(events, when, strict=True)], max_entries=_MAX_NAMED)
+    told = listed([event.text for event in events], max_entries=_MAX_NAMED)
     left_out = f"The tests leave out {count_with_noun(len(events), 'brief disturbance')}: {told}."
     check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
@@ -316,54 +293,7 @@ def _remains(result: DiagnosisResult) -> list[str]:
         changes.append((abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9), text))
     ranked = sorted(changes, key=lambda own: -own[0])
     moved = listed([text for change, text in ranked if change > _MIN_RELATIVE_CHANGE], max_entries=_MAX_NAMED)
-    return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]
-
-
-def _earlier_runs(result: DiagnosisResult) -> list[str]:
-    """Sentences on changes since the baseline."""
-    since, rivals, moved = result.baseline_comparison, result.confusable_parameter_changes, list[str]()
-    if since is None:
-        return []
-    for own in since.significant_parameter_shifts:
-        before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
-        now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
-        moved.append(f"{own.name} from {before} to {now} {own.unit}")
-    changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
-    changed += f"{listed(moved)}. If nothing was altered on purpose, find the cause before you use the values."
-    p = since.between_runs_p_value
-    differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
-    small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
-    return _said(
-        (moved, changed),
-        (not [*moved, *rivals], "No parameter differs significantly from the baseline (the earlier runs)."),
-        (rivals, f"A change of {listed(rivals)} since the baseline explains about as much as the effects."),
-        (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
-        (not since.is_baseline_explained, small),
-    )
-
-
-def _counterfactual(swapped: CounterfactualPredictionErrors | None) -> list[str]:
-    """Sentences on predictions of recordings made without the effects, and of those with them."""
-    if swapped is None:
-        return []
-    text, other = list[str](), swapped.effects_added.rmse_by_unit
-    for how, part in (("without", swapped.effects_removed), ("with", swapped.effects_added)):
-        errors, names = part.rmse_by_unit, listed([name.removesuffix(" (without)") for name in part.recordings])
-        plain, then = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in errors.items()) for i in (0, 1))
-        made = f"Recordings made {how} the effects ({names})"
-        failed = f"{made} could not be predicted ({part.failure_message}), so they do not test the effects."
-        found = f"{made} are predicted with an error of {then} (rms) by the model {how} the effects, and of {plain} by "
-        found += "the model before the diagnosis."
-        # at most 1 for the recordings with the effects
-        ratios = [min(errors[unit]) / max(other[unit]) for unit in errors.keys() & other]
-        worse = f"over {_FAULTY_RECORDING_ERROR_RATIO} times those on the recordings with the effects"
-        faulty = f"Both errors are {worse}, so {names} may be faulty. Check clock, units and setup."
-        same = " and ".join(unit for unit, (before, after) in errors.items() if after > 0.999 * before)
-        wrong = f"The diagnosis does not lower the error in {same} on {names}, so it may be wrong."
-        text += _said(
-            (part.failure_message, failed),
-            (max(ratios, default=0.0) > _FAULTY_RECORDING_ERROR_RATIO, f"{found}\n{faulty}"),
-            (not part.is_improved_by_counterfactual, f"{found}\n{wrong}"),
-            (True, found),
-        )[:1]
-    return text
+    return [
+        " ".join(said),
+        *_said((moved, f"With the effects in the model, these estimates change: {moved}.")),
+    ]

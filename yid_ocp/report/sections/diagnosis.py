@@ -167,14 +167,13 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.sentences import overspeed_truncation_messages  # other commands need none of it
-
     events = finding.events
     if not events:
         return None
     drawn = "Points show the force or torque that the model lacks. Points of a correct model lie between grey lines. "
     drawn += "Shaded windows are events, with their shape as a line. Where possible, the results below leave them out."
-    sentences = [drawn * bool(events.force_estimates), *overspeed_truncation_messages(finding)]
+    told = events.overspeed_sentences(finding.thresholds.max_joint_speed)
+    sentences = [drawn * bool(events.force_estimates), *told]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
         found = [event for event in events.events_of_recording(force.recording) if event.channel == force.coordinate]
