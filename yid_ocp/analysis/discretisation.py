@@ -173,15 +173,15 @@ def predicted_chi2_fall_at_finer_step(
 
 def stds_with_time_step_and_encoder_errors(
     fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation, stds: Mapping[str, float]
-) -> dict[str, float] | None:
+) -> dict[str, float]:
     """Add the errors of the time step and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
 
-    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. None if `fine` fails.
+    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Empty if `fine` fails.
     """
     fine = fine.with_episodes(list(map(_with_data_of, fine.episodes, coarse.episodes)), ())  # corrected for links
     made = _gauss_newton_step_in_finer_model(_FinerModel(fine), coarse, x, at_x)
     if isinstance(made, str):
-        return None
+        return {}
     shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
     return {name: _std_with_shifts(std, [own[name] for own in shifts if name in own]) for name, std in stds.items()}
 

@@ -268,7 +268,7 @@ def _with_errors_of_step_and_encoders(
     """The fit with standard deviations that contain these errors, and whether they could be computed."""
     fine = _at_finer_step(search, fit, events)
     std = discretisation.stds_with_time_step_and_encoder_errors(fine, *fit.at_estimates, fit.std)
-    return (fit, False) if std is None else (replace(fit, std=std), True)
+    return replace(fit, std=fit.std | std), bool(std)
 
 
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined:
