@@ -153,18 +153,13 @@ CAMERA = PointSensor("points_camera", ("w_T1", "w_T3"), ("w_T1", "w_T3"), POSE)
 
 
 @pytest.fixture(scope="session")
-def benches() -> dict[str, Bench]:
-    return {"driven": Bench(build()), "prescribed": Bench(build(prescribed=True))}
+def driven() -> Bench:
+    return Bench(build())
 
 
 @pytest.fixture(scope="session")
-def driven(benches) -> Bench:
-    return benches["driven"]
-
-
-@pytest.fixture(scope="session")
-def prescribed(benches) -> Bench:
-    return benches["prescribed"]
+def prescribed() -> Bench:
+    return Bench(build(prescribed=True))
 
 
 @pytest.fixture(scope="session")

@@ -84,8 +84,8 @@ CASES = [("prescribed", "none"), ("driven", "proportional"), ("driven", "lqr")]
 
 
 @pytest.mark.parametrize(("mode", "feedback"), CASES)
-def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
-    bench = benches[mode]
+def test_neutral_readings_change_nothing(mode, feedback, request) -> None:
+    bench = request.getfixturevalue(mode)
     plain = problem(bench, (), feedback=feedback)
     full = problem(bench, KINDS, neutral=True, feedback=feedback)
     one, other = (p.evaluate(p.initial_unknowns, derivatives=False) for p in (plain, full))
@@ -103,12 +103,13 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 
 
-def test_a_problem_takes_gains_and_equilibria_from_one_of_the_same_arms(benches) -> None:
+def test_a_problem_takes_gains_and_equilibria_from_one_of_the_same_arms(driven) -> None:
     """An effect that adds coordinates moves the states of the arms; what is taken belongs to the states as they are."""
-    bench = benches["driven"]
-    plain, soft = problem(bench, (), feedback="lqr"), make_effect("junction_compliance", "w_T1", bench.system)
-    step = compile_step(bench.system.with_effects([soft]), H, use_compiler=False)
-    full, made = (EstimationProblem(step, [recording(bench)], plain.free, plain.options, like=p) for p in (None, plain))
+    plain, soft = problem(driven, (), feedback="lqr"), make_effect("junction_compliance", "w_T1", driven.system)
+    step = compile_step(driven.system.with_effects([soft]), H, use_compiler=False)
+    full, made = (
+        EstimationProblem(step, [recording(driven)], plain.free, plain.options, like=p) for p in (None, plain)
+    )
     (first,), (own,), (other,) = (p.episodes for p in (plain, full, made))
     assert other.tracking_feedback.gain is first.tracking_feedback.gain
     assert list(other.tracking_feedback.state_indices) == list(own.tracking_feedback.state_indices)
@@ -119,8 +120,8 @@ def test_a_problem_takes_gains_and_equilibria_from_one_of_the_same_arms(benches)
 
 
 @pytest.mark.parametrize(("mode", "feedback"), CASES)
-def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback, benches) -> None:
-    task = problem(benches[mode], KINDS, feedback=feedback)
+def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback, request) -> None:
+    task = problem(request.getfixturevalue(mode), KINDS, feedback=feedback)
     x = task.initial_unknowns
     result = task.evaluate(x)
     assert result.ok, result.message
@@ -247,13 +248,10 @@ def at(bench, step, effects, where: str) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def cases(benches, all_effects):
-    @cache
-    def built(mode: str):
-        effects = all_effects(benches[mode].system)
-        return benches[mode], benches[mode].step(*effects), effects
-
-    return cache(lambda mode, where: at(*built(mode), where))
+def cases(driven, prescribed, all_effects):
+    effects = {bench: all_effects(bench.system) for bench in (driven, prescribed)}
+    step, benches = cache(lambda bench: bench.step(*effects[bench])), {"driven": driven, "prescribed": prescribed}
+    return cache(lambda mode, where: at(own := benches[mode], step(own), effects[own], where))
 
 
 @pytest.mark.parametrize("where", ["neutral", "away"])
@@ -319,8 +317,8 @@ def largest(difference, reference) -> float:
 
 
 @pytest.mark.parametrize("mode", ["driven", "prescribed"])
-def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, sensors) -> None:
-    bench = benches[mode]
+def test_at_neutral_parameters_they_change_nothing(mode, request, all_effects, sensors) -> None:
+    bench = request.getfixturevalue(mode)
     plain, full = bench.run(bench.plain), bench.run(bench.step(*all_effects(bench.system)))
     assert full.rollout.status.is_converged
     assert full.rollout.status.newton_iterations <= 1.5 * plain.rollout.status.newton_iterations

@@ -35,6 +35,7 @@ from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, Zer
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**26
+_LAG_CUTOFF_FRACTION = 1 / 3  # of the path cutoff, up to which predicted efforts lag
 _MAX_RESTING_TIME = 1.0  # latest time at which a point's first sample still shows the shape of the equilibrium [s]
 # root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
 _POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
@@ -349,10 +350,21 @@ class EpisodePredictor:
         effort, slope = rollout.effort, rollout.effort_sensitivity
         lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
         if lag is not None:
-            effort, slope = FirstOrderLag(*lag, self.integrator_step.time_step).lagged_node_values(effort, slope)
+            effort, slope = self._effort_lag(episode, lag).lagged_node_values(effort, slope)
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
         return replace(rollout, effort=effort, effort_sensitivity=slope)
+
+    def _effort_lag(self, episode: Episode, lag: tuple[Array, Array]) -> FirstOrderLag:
+        """The lag of predicted efforts at low frequencies, above which they are mostly noise of accelerations.
+
+        A lag that amplified this noise would be estimated too small.
+        """
+        h, slow = self.integrator_step.time_step, None
+        if math.isfinite(self.options.path_cutoff):
+            low_pass = ZeroPhaseLowPassFilter(_LAG_CUTOFF_FRACTION * self.options.path_cutoff)
+            slow = low_pass.node_smoother(np.arange(episode.grid.steps), episode.grid.steps, h)
+        return FirstOrderLag(*lag, h, slow)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeValueSmoother | None:
         """Make a smoother of predicted efforts that equals the filter of measured efforts. None without a filter."""
@@ -427,8 +439,7 @@ class EpisodePredictor:
             by_effort = smooth.smoothing_adjoint(by_effort)
         lag = self.model_functions.input_corrections.joint_delays_or_lag_times("effort_lag", theta, wanted)
         if lag is not None:
-            lagged = FirstOrderLag(*lag, self.integrator_step.time_step)
-            by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
+            by_effort, by_lag = self._effort_lag(episode, lag).lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.tracking_feedback
         if feedback is not None:

@@ -149,6 +149,7 @@ class FirstOrderLag:
     time_constant: Array  # T, (k,) [s]
     time_constant_sensitivity: Array  # (k, d)
     time_step: float  # h [s]
+    slow_part: NodeValueSmoother | None = None  # what lags of the node values; None if all does
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
         """Compute the lag's mean output z in each step, with derivatives, for inputs x (N, k) held over a step.
@@ -168,25 +169,29 @@ class FirstOrderLag:
         """Compute the lag's output at the nodes, with derivatives, for an input x (N, k) that is linear between nodes.
 
         The lag starts at node 1. The output is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1} or, for negative T, x -
-        T dx/dt by central differences. `slope` (N, k, d) is dx, first by those of `time_constant_sensitivity`.
+        T dx/dt by central differences. `slope` (N, k, d) is dx, first by those of `time_constant_sensitivity`. With
+        `slow_part`, x is what this smoother keeps, and the rest of the value is added to the output.
         """
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
-        followed = self._straight(value, decay, share) - lead * (rates @ value)
+        slow = self._slow(value)
+        followed = self._straight(slow, decay, share) - lead * (rates @ slow)
         if slope is None:
-            return followed, None
-        total = self._straight(slope, decay[:, None], share[:, None])
+            return followed + (value - slow), None
+        slow_slope = self._slow(slope)
+        total = self._straight(slow_slope, decay[:, None], share[:, None]) + (slope - slow_slope)
         if np.any(lead):
-            total -= lead[:, None] * (rates @ slope.reshape(len(slope), -1)).reshape(slope.shape)
+            total -= lead[:, None] * (rates @ slow_slope.reshape(len(slope), -1)).reshape(slope.shape)
         width = self.time_constant_sensitivity.shape[1]
-        total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.time_constant_sensitivity
-        return followed, total
+        total[:, :, :width] += self._by_time(slow, followed)[:, :, None] * self.time_constant_sensitivity
+        return followed + (value - slow), total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
         """Convert a cost's gradient `pull` (N, k) by lagged values to its gradients by the input and by parameters."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
-        by_time = self._by_time(value, self._straight(value, decay, share))
+        slow = self._slow(value)
+        by_time = self._by_time(slow, self._straight(slow, decay, share))
         direct = np.sum(pull * by_time, axis=0) @ self.time_constant_sensitivity
         back = pull.copy()
         for k in range(len(back) - 2, 0, -1):
@@ -194,7 +199,11 @@ class FirstOrderLag:
         passed = back.copy()
         passed[2:] *= 1 - share
         passed[1:-1] += (share - decay) * back[2:]
-        return passed - rates.T @ (lead * pull), direct
+        passed -= rates.T @ (lead * pull)
+        return passed if self.slow_part is None else pull + self.slow_part.smoothing_adjoint(passed - pull), direct
+
+    def _slow(self, value: Array) -> Array:
+        return value if self.slow_part is None else self.slow_part.smooth(value)
 
     def _factors(self) -> tuple[Array, Array, Array, Array]:
         ratio = np.maximum(self.time_constant, 0.0) / self.time_step
