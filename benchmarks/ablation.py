@@ -43,6 +43,7 @@ CONSTANTS = {
     "_LOSS_RTOL": (select, 1e-12),
     "_MIN_CHI2_FRACTION": (select, 0.0),
     "_LOG_ODDS_FACTOR": (select, 1.0),
+    "_MIN_FIRST_PART": (select, 0.0),
     "_MIN_FURTHER_PART": (select, 0.0),
     "_SET_PROBABILITY": (select, 1.0),
 }

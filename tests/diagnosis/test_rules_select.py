@@ -412,7 +412,8 @@ def test_a_rest_that_is_hardly_more_than_noise_is_left(monkeypatch, least, whole
 @cases(
     "nominal, best, chosen",
     {
-        "everywhere": ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), ["a"]),
+        "everywhere": ((3.0, 3.0, 3.0), (2.4, 2.4, 2.4), ["a"]),
+        "everywhere, but little": ((3.0, 3.0, 3.0), (2.6, 2.6, 2.6), []),
         "not sure": ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
         "no gap": ((0.9, 1.0, 1.0), (0.88, 0.98, 0.98), []),
         "likelier": ((1.0, 1.0, 1.0), (0.9, 0.99, 1.0), ["a"]),

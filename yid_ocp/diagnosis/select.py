@@ -20,6 +20,7 @@ _LOSS_RTOL = 1.4e-3  # relative difference of the losses of equivalent effects' 
 _MIN_CHI2_FRACTION = 0.05**2
 _LOG_ODDS_FACTOR = 2.0  # by which half a difference of BIC exceeds the log odds that simulated cases show
 _LOG_ODDS_PER_DISTANCE = 5.0  # between models, where 1 is the distance at which recordings tell them apart
+_MIN_FIRST_PART = 0.25  # of the gap, to be explained by the first effect; others are not looked for beside less
 _MIN_FURTHER_PART = 0.4  # of the gap that other effects leave, to be explained by a further one
 _SET_PROBABILITY = 0.95  # that one of a selected effect and its equivalents is right if one of those near the best is
 
@@ -125,7 +126,7 @@ def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Threshold
     gained, error = null_test.chi2_per_sample_decrease_and_std_error(before, after)
     part_of_fitted = 2 * (without.cost - fit.cost) / max(without.excess_chi2, 1.0)
     part = max(part_of_fitted, gained / max(before.excess_chi2_per_sample, 1e-9))
-    is_clear = gained > error and part > _MIN_FURTHER_PART * bool(without.effects)
+    is_clear = gained > error and part > (_MIN_FURTHER_PART if without.effects else _MIN_FIRST_PART)
     if _leaves_noise(without, limits):
         is_clear = before.total_chi2 - after.total_chi2 > 2 * limits.min_log_bayes_factor
     # the amplitudes of an effect together are at least as significant as one amplitude at `min_z` standard deviations

@@ -31,11 +31,10 @@ from yid_ocp.problem.model_functions import (
 )
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import step_mean_input_delay_derivative, step_mean_inputs
-from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter
+from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter, slow_effort_filter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**26
-_LAG_CUTOFF_FRACTION = 1 / 3  # of the path cutoff, up to which predicted efforts lag
 _MAX_RESTING_TIME = 1.0  # latest time at which a point's first sample still shows the shape of the equilibrium [s]
 # root mean square error of first points above which another equilibrium is sought [stds], and the part that may remain
 _POOR_EQUILIBRIUM_RMSE, _MAX_REMAINING_ERROR_FRACTION = 5.0, 0.5
@@ -356,14 +355,10 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def _effort_lag(self, episode: Episode, lag: tuple[Array, Array]) -> FirstOrderLag:
-        """The lag of predicted efforts at low frequencies, above which they are mostly noise of accelerations.
-
-        A lag that amplified this noise would be estimated too small.
-        """
-        h, slow = self.integrator_step.time_step, None
-        if math.isfinite(self.options.path_cutoff):
-            low_pass = ZeroPhaseLowPassFilter(_LAG_CUTOFF_FRACTION * self.options.path_cutoff)
-            slow = low_pass.node_smoother(np.arange(episode.grid.steps), episode.grid.steps, h)
+        """The lag of the slow part of predicted efforts. A lag that amplified noise would be estimated too small."""
+        h, count, cutoff = self.integrator_step.time_step, episode.grid.steps, self.options.path_cutoff
+        is_filtered = math.isfinite(cutoff)
+        slow = slow_effort_filter(cutoff).node_smoother(np.arange(count), count, h) if is_filtered else None
         return FirstOrderLag(*lag, h, slow)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeValueSmoother | None:

@@ -36,13 +36,9 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     step_mean_inputs,
 )
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
+from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, slow_effort_filter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors import joints as joint_sensors
-
-# Efforts of joints moved as measured are noisy and compared with predictions, so gears give way to slow parts of them
-# only: below this fraction of the cutoff of the path, whose accelerations would contain the noise of faster parts.
-_GEAR_LOAD_CUTOFF_FRACTION = 0.25
 
 
 @dataclass(frozen=True)
@@ -243,8 +239,7 @@ def prepare_episode(
     samples = _samples(step, recording, options, theta, grid, uncertain, sticking)
     load = np.zeros((grid.steps + 1, len(system.driven) + len(system.prescribed)))
     if functions.input_corrections.angles_depend_on_effort:
-        slow = ZeroPhaseLowPassFilter(_GEAR_LOAD_CUTOFF_FRACTION * options.path_cutoff)
-        parts = ((system.driven, low_pass), (system.prescribed, slow))
+        parts = ((system.driven, low_pass), (system.prescribed, slow_effort_filter(options.path_cutoff)))
         load = np.hstack([smoothed_efforts_at_nodes(recording, names, grid, own) for names, own in parts if names])
     known_parameters = options.parameters_by_recording.get(recording.name, {})
     start = errors = None

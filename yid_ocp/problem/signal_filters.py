@@ -17,6 +17,7 @@ from yid_ocp.errors import DataError
 
 _MIN_CUTOFF_FRACTION = 1e-4  # of half the sampling rate; below it, the filter's sections are numerically singular
 _FILTER_ORDER = 4
+_SLOW_EFFORT_CUTOFF_FRACTION = 0.25
 _MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weights are dropped in the filter's matrix
 
 
@@ -136,6 +137,14 @@ def _smoothing_matrix(
 def zero_phase_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
     """Make the low-pass filter of measured and predicted efforts: two passes of the zero-phase filter of paths."""
     return ZeroPhaseLowPassFilter(cutoff, 2)
+
+
+def slow_effort_filter(cutoff: float) -> ZeroPhaseLowPassFilter:
+    """Make the filter of the slow part of efforts, whose faster part has much noise of accelerations.
+
+    Where a joint moves as measured, its gear gives way to the slow part only, and only the slow part lags.
+    """
+    return ZeroPhaseLowPassFilter(_SLOW_EFFORT_CUTOFF_FRACTION * cutoff)
 
 
 @dataclass(frozen=True)
