@@ -23,8 +23,7 @@ from yid_ocp.errors import DataError, OutputError, nearest_name_question
 
 _DataclassType = TypeVar("_DataclassType")
 
-MAX_INPUT_NUMBERS = 50_000_000
-"""Largest count of numbers in one input file; as float64 with copies (40 bytes each) they take 2 GB."""
+MAX_INPUT_NUMBERS = 50_000_000  # in one input file; as float64 with copies (40 bytes each) they take 2 GB
 MAX_TEXT_BYTES = 1 << 26  # largest size of a file that is read as one text
 _MEMORY_OF_READING = 7 << 28  # address space for a library that reads a file [bytes]
 

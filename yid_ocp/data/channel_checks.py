@@ -265,13 +265,10 @@ def typical_point_pair_distances(
 
 IssueSeverity = Literal["warning", "not_trusted", "refused"]
 
-LIMIT_VIOLATION_RATIO_CAP = 1e3
-"""Largest value of `Issue.limit_violation_ratio`; larger ratios are clipped."""
+LIMIT_VIOLATION_RATIO_CAP = 1e3  # largest value of `Issue.limit_violation_ratio`; larger ratios are clipped
 DEGREES_PER_RADIAN = math.degrees(1.0)
-MIN_DIFFERENCES_FOR_NOISE_STD = 30
-"""Smallest number of differences between samples from which a channel's noise is estimated."""
-LATE_POINTS_WORDS = "the points match the angles best if shifted by "
-"""Words of a note of merged files; the shift [s] follows."""
+MIN_DIFFERENCES_FOR_NOISE_STD = 30  # least number of differences of samples that give a channel's noise
+LATE_POINTS_WORDS = "the points match the angles best if shifted by "  # note of merged files; the shift [s] follows
 
 
 @dataclass(frozen=True)

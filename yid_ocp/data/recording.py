@@ -33,8 +33,7 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 JOINT_NOISE_AND_SERVO_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
 """Names of the optional constants of a joint group. A constant is one number for all joints, or one for each joint."""
-POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
-"""Pattern of allowed names of point groups."""
+POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")  # pattern of allowed names of point groups
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
 _LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}

@@ -214,8 +214,7 @@ def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))
 
 
-_ChannelErrors = Mapping[str, tuple[float, str]]
-"""Root mean square error and its unit by channel."""
+_ChannelErrors = Mapping[str, tuple[float, str]]  # root mean square error and its unit by channel
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,7 @@ BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "finer_chain": 0.06,
 }
 """Fraction of all cases in each category (`CaseGroundTruth.category`)."""
-BLIND_ENSEMBLE_PURPOSES = ("report", "calibration")
-"""Purposes of an ensemble. One seed gives different cases for each purpose."""
+BLIND_ENSEMBLE_PURPOSES = ("report", "calibration")  # one seed gives different cases for each purpose
 _MIN_CASES_PER_EXPERIMENT = 3  # experiments with fewer cases are left out, because each must be compiled
 
 
@@ -109,8 +108,7 @@ def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
     return found
 
 
-MAX_DRAWS_PER_CASE = 64
-"""Largest number of draws (motion, object, effects) for a case. With eight, 1 of 300 cases was not simulated."""
+MAX_DRAWS_PER_CASE = 64  # motions, objects and effects; with eight, 1 of 300 cases was not simulated
 _STIFFNESS_SPREAD_FACTOR = 1.5  # factor by which true stiffnesses lie above or below the problem's start, at most
 _PRIOR_DEVIATIONS = (0.6, 1.0)  # deviation of a parameter with a prior from its initial value, in stds of the prior
 _BRISK_FREQUENCY_FACTOR = 1.41  # together with the second harmonic, triples the accelerations

@@ -120,8 +120,7 @@ _MIN_PULSE_POINTS = 2.5  # duration of the shortest pulse, in time points of the
 _WINDOW_GROWTH = 1.25  # ratio of successive window lengths
 _FLAT_RAMP_FRACTION = 0.5  # fraction of a flat-topped pulse's duration in which it rises or falls
 _MAX_PROFILES = 12  # largest number of pulses and similar profiles in one history
-MAX_EVENT_TIME_FRACTION = 1 / 3
-"""Fraction of the time above which short forces are not events, because model error dominates."""
+MAX_EVENT_TIME_FRACTION = 1 / 3  # of the time; more short forces are model error, not events
 _SAMPLES_PER_BLOCK = 4096  # of profiles that are filtered at once
 _MIN_PROMINENCE_RATIO = 1.5  # smallest ratio of a pulse's size to the median size at all times; above that of a sine
 _MAX_PULSE_RANGE_RATIO = 1.5  # largest ratio of a pulse to the range of the history around it

@@ -55,8 +55,7 @@ class RefitStore:
         """Store a refit under a name."""
 
 
-NO_REFIT_STORE = RefitStore()
-"""Store of a diagnosis that no other one resumes."""
+NO_REFIT_STORE = RefitStore()  # store of a diagnosis that no other one resumes
 
 
 @dataclass(frozen=True)
@@ -227,8 +226,7 @@ class RefitContext:
         return found
 
 
-EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]
-"""Effects to refit, and their values at the start."""
+EffectsWithStart = tuple[Sequence[EffectBase], Mapping[str, float]]  # effects to refit, and their values at the start
 _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
 """Problem with filters linearised about the torques at the end of a run, the run, and the evaluation at its end."""
 

@@ -13,8 +13,7 @@ from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, effort_scaled_parameter_definition
 from yid_ocp.model.system import Effect, EffectStepTerms, MidpointStateSymbols, System
 
-SIGN_SMOOTHING_SPEED = 0.02
-"""v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
+SIGN_SMOOTHING_SPEED = 0.02  # v_s in sgn(v) = tanh(v/v_s) [rad/s]
 TORQUE_DRIVEN_SIGN_SMOOTHING_SPEED = 1e-3
 """v_s of joints driven by torques [rad/s]. With a larger v_s they would creep by mm before they break loose."""
 _LOAD_SIGN_SMOOTHING_SPEED = 0.005  # for load-dependent friction, which must hold its load at rest [rad/s]

@@ -37,8 +37,7 @@ from yid_ocp.parallel import CasadiLockedCache, call_merged_with_other_threads, 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch of any size, in rollouts of one member, and the extra cost per sensitivity column."""
 _MIN_BATCH_SPEEDUP = 1.5  # minimum speed-up of a batch over single rollouts; above 2 it is also faster than two threads
-MIN_STEPS_TO_COMPILE_BATCH = 50_000
-"""Number of steps that could have been batched after which the batched kernel is compiled."""
+MIN_STEPS_TO_COMPILE_BATCH = 50_000  # that could have been batched, after which the batched kernel is compiled
 
 
 class _Struct(ctypes.Structure):

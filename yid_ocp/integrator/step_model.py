@@ -17,8 +17,7 @@ from yid_ocp.integrator import codegen
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
 
-NEWTON_ITERATION_LIMIT = 60
-"""Newton iterations of one step before it is given up."""
+NEWTON_ITERATION_LIMIT = 60  # Newton iterations of one step before it is given up
 
 # Newton stops when a correction of the coordinates is below _COORDINATE_TOLERANCE [rad or m], and for short steps below
 # _VELOCITY_TOLERANCE times the step: a remaining correction loses momentum (mass times correction over step).
@@ -85,8 +84,7 @@ _STATUS_MESSAGES = {
     NewtonStatusCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
-_LONG_ROLLOUT_STEPS = 100
-"""Number of steps after which a failure is attributed to the integration method, not to the initial state."""
+_LONG_ROLLOUT_STEPS = 100  # after which a failure is due to the integration method, not to the initial state
 _INSTABILITY_CAUSE = "usually because a fast vibration grows: the midpoint rule has no numerical damping"
 
 

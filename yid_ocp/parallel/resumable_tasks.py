@@ -82,8 +82,7 @@ class WorkerConfig:
                 pass
 
 
-LOCAL_WORKER_CONFIG = WorkerConfig()
-"""One process per processor of this machine."""
+LOCAL_WORKER_CONFIG = WorkerConfig()  # one process per processor of this machine
 
 
 def run_tasks(

@@ -55,8 +55,7 @@ def _max_threads() -> int:
 
 # CasADi marks the nodes of expressions during differentiation: two threads that differentiate expressions with shared
 # symbols get wrong derivatives. Evaluating finished functions is safe.
-CASADI_LOCK = threading.RLock()
-"""The lock that a thread must hold while it builds or differentiates shared CasADi expressions."""
+CASADI_LOCK = threading.RLock()  # held by the thread that builds or differentiates shared CasADi expressions
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):

@@ -50,8 +50,7 @@ from yid_ocp.problem.options import MultivariateGaussianPrior, ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 
-_HELD_OUT_START_WINDOW = 0.2
-"""Duration of a sensor's first samples from which a held-out recording's initial state is estimated [s]."""
+_HELD_OUT_START_WINDOW = 0.2  # of a sensor's first samples, which give a held-out recording's initial state [s]
 _HELD_OUT_ITERATIONS = 3  # Gauss-Newton iterations of this nearly linear estimate
 
 

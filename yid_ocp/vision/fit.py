@@ -33,8 +33,7 @@ from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud, Sh
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
 from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segment
 
-_Left = tuple[BoolArray, BoolArray]
-"""Masks of the nodes and points of a frame that are used."""
+_Left = tuple[BoolArray, BoolArray]  # masks of the nodes and points of a frame that are used
 _NODE_RADIUS_FRACTION = math.pi / 4  # distance of the mean of a tube's visible half from its axis, over the radius
 _END_OFFSET_STDS = 3.0  # stds of a point beyond which an end differs from the shape
 _MAX_POINT_DISTANCE_SCALES = 3.0  # in last loss scales; points further away carry no information on the shape

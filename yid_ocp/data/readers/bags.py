@@ -28,8 +28,7 @@ from yid_ocp.errors import DataError, import_optional, nearest_name_question, un
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
-JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
-"""ROS type name of joint state messages."""
+JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"  # ROS type name of joint state messages
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform"))
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

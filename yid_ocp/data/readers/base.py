@@ -46,8 +46,7 @@ READERS: Registry[Callable[..., Recording]] = Registry("recording format")
 FILE_PREVIEWERS: Registry[Callable[..., FilePreview]] = Registry("recording format with a preview")
 """Functions that list a file's contents without importing it, by the keys of `READERS`. Each takes a path."""
 
-SKIP_COLUMN_KEYWORD = "skip"
-"""Column meaning that omits the column."""
+SKIP_COLUMN_KEYWORD = "skip"  # column meaning that omits the column
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -56,8 +55,7 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
 }
-MOTOR_CURRENT_UNITS = ("A", "mA")
-"""Units of `effort` for motor currents."""
+MOTOR_CURRENT_UNITS = ("A", "mA")  # units of `effort` for motor currents
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
 _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""

@@ -30,8 +30,7 @@ _CHANNELS = {
 """Features besides state and action that some robots record, with one number per joint."""
 _SUFFIXES = {"pos": "position", "vel": "velocity", "torque": "effort", "effort": "effort", "current": "effort"}
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
-_BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""Features that number frames and tasks."""
+_BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # numbers of frames and tasks
 _NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
 """Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
 _MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
