@@ -112,8 +112,7 @@ def test_noise_of_the_followed_values_does_not_hide_a_lag() -> None:
     recorded = 10 * np.sin(5 * t)[:, None] + 0.02 * 50 * np.cos(5 * t)[:, None]
     for slow_part in (None, ZeroPhaseLowPassFilter(5.0).node_smoother(np.arange(len(t)), len(t), H)):
         lags = [FirstOrderLag(np.array([-x]), np.ones((1, 1)), H, slow_part) for x in tried]
-        best.append(
-            tried[np.argmin([np.sum((own.lagged_node_values(value, None)[0] - recorded) ** 2) for own in lags])]
-        )
+        left = [np.sum((own.lagged_node_values(value, None)[0] - recorded) ** 2) for own in lags]
+        best.append(tried[np.argmin(left)])
     assert best[0] < 0.01
     assert best[1] == pytest.approx(0.02, abs=0.002)
