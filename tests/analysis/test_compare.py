@@ -19,6 +19,7 @@ from yid_ocp.analysis.estimation import choose_fit_with_or_without_shape_memory,
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, fit_problem
 from yid_ocp.solvers.base import StopSearch
 from yid_ocp.workflow.build_problem import load_problem
@@ -460,10 +461,11 @@ def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_s
     step = pendulum_step(urdf_folder, driven=("shoulder",))
     how = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 
-    def expected(size):
+    def expected(size, share=1.0):
         recordings = [taken(step, seed) for seed in (3, 4)]
         recordings = [replace(r, joints=replace(r.joints, effort_std=size, effort_bias_std=size)) for r in recordings]
-        options = ProblemOptions(path_cutoff=math.inf, **how)
+        limits = ExcessResidualCriteria(noise_fraction_of_stated_std=share)
+        options = ProblemOptions(path_cutoff=math.inf, excess_residual_criteria=limits, **how)
         made = EstimationProblem(step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:])
         fit = replace(solution(elbow_stiffness=estimate(1.0)), x=made.initial_unknowns)
         checks = estimation.add_intervals_and_checks(made, fit).checks
@@ -473,6 +475,7 @@ def test_the_error_to_expect_is_that_of_the_sensors_and_of_torques_as_wrong_as_s
         return found["run_4"]["points_arm.tip"]
 
     exact, small, large = map(expected, (0.0, 0.05, 0.1))
+    assert expected(0.1, 0.25) == pytest.approx(0.25 * large)
     assert exact == pytest.approx(math.sqrt(3) * 0.02)
     assert small > exact + 1e-5
     assert (large**2 - exact**2) / (small**2 - exact**2) == pytest.approx(4.0, rel=0.1)

@@ -66,7 +66,8 @@ def solve(
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
     text = f"solving for {len(problem.initial_unknowns)} unknowns by {solver.name}"
     if problem.options.weighting != "paper":
-        text += f" (noise alone gives a cost near {problem.residual_rows.data.stop / 2:.4g})"
+        noise_cost = limits.noise_fraction_of_stated_std**2 * problem.residual_rows.data.stop / 2
+        text += f" (noise alone gives a cost near {noise_cost:.4g})"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
     safe = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
@@ -299,6 +300,7 @@ def _predict_held_out_with_expected_errors(
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs, expected = list[EpisodeAndPredictionOrFailure](), dict[str, dict[str, float]]()
     for episode, theta, offset in held_out_prediction_arguments(problem, x):
+    share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
         outcome = predict(episode, theta, offset, False)
         pairs.append((episode, outcome))
         if isinstance(outcome, str):
@@ -312,7 +314,8 @@ def _predict_held_out_with_expected_errors(
                 moved = replace(errors, torque_bias=bias, torque_noise=errors.torque_noise + white)
                 other = replace(episode, input_errors=moved)
                 drawn.append(predict(other, theta, offset, False, outcome.equilibrium_guess))
-        expected[episode.name] = _expected_errors(episode, outcome, drawn)
+        errors_of_stated_stds = _expected_errors(episode, outcome, drawn).items()
+        expected[episode.name] = {channel: share * rms for channel, rms in errors_of_stated_stds}
     return pairs, expected
 
 

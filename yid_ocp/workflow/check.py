@@ -63,7 +63,9 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         if problem is not None:
             first = problem.evaluate(problem.initial_unknowns)
             moved = _moves(problem, first, warnings, coarse, progress)
-            misfit = float(np.sqrt(np.mean(first.residual[problem.residual_rows.data] ** 2))) if first.ok else None
+            noise = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
+            residual = first.residual[problem.residual_rows.data] / noise
+            misfit = float(np.sqrt(np.mean(residual**2))) if first.ok else None
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
@@ -106,12 +108,12 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
     recording, system, arm = episode.recording, problem.system, episode.recording.joints
-    noise = _input_noise(problem, episode)
+    noise, share = _input_noise(problem, episode), problem.options.excess_residual_criteria.noise_fraction_of_stated_std
     for samples in episode.measurements:
         known = samples.std[np.isfinite(samples.std)]
         noise[samples.sensor.group_name] = {
             "samples": int(np.sum(np.any(samples.weight > 0, axis=1))),
-            "std": float(np.median(known)) if known.size else None,
+            "std": share * float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
     groups = {group.name: _group(group) for group in recording.all_groups}

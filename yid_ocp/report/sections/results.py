@@ -290,12 +290,12 @@ def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tu
         names, width = sensor.channel_names, sensor.outputs_per_channel
         parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
         by_sensor = np.sqrt(np.mean(samples.std**2, axis=0).reshape(-1, width).sum(axis=1))
-        wider = [own.expected_errors.get(n, noise) / noise for n, noise in zip(names, by_sensor, strict=True)]
+        shares = [own.expected_errors.get(n, noise_fraction * s) / s for n, s in zip(names, by_sensor, strict=True)]
         for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
             curves: list[TimePlotData] = []
             for i in columns:
                 name = sensor.output_names[i].rsplit(".", 1)[1]
-                std = noise_fraction * wider[i // width] * samples.std[:, i]
+                std = shares[i // width] * samples.std[:, i]
                 told = (t, samples.value[:, i], std, {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
                 curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
