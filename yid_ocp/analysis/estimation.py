@@ -127,6 +127,7 @@ def add_discretisation_errors(
     uncounted = tuple(words for kind, words in UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
     if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
         uncounted = tuple(words for words in uncounted if words != UNCOUNTED_ERROR_TEXTS["links"])
+    notes = [*(() if solution.checks is None else solution.checks.notes), *notes]
     checks = uncertainty.EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes))
     return replace(solution, parameters=inflated), replace(checks, uncounted_errors=uncounted)
 
@@ -299,8 +300,8 @@ def _predict_held_out_with_expected_errors(
     """Predict the held-out recordings, and compute by channel the rms errors that sensor and torque noise cause."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
     pairs, expected = list[EpisodeAndPredictionOrFailure](), dict[str, dict[str, float]]()
-    for episode, theta, offset in held_out_prediction_arguments(problem, x):
     share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
+    for episode, theta, offset in held_out_prediction_arguments(problem, x):
         outcome = predict(episode, theta, offset, False)
         pairs.append((episode, outcome))
         if isinstance(outcome, str):

@@ -76,10 +76,11 @@ def compute_profile_likelihood_interval(
     lower, upper = walk.end(-1, size), walk.end(1, size)
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
-    if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
-        said = f"a better fit exists (chi2 lower by {-walk.base:.2g}), so the values are not the best ones"
-        walk.notes.append(f"{said}. Repeat `yid-ocp solve` with other initial values (parameters.NAME.initial)")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
+    if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
+        better = f"{values[np.argmin(deltas)]:.4g} (chi2 lower by {-walk.base:.2g}), so no value is the best one"
+        again = f"Repeat `yid-ocp solve` with --set parameters.{name.partition('[')[0]}.initial={better.split()[0]}"
+        walk.notes.append(f"a better fit exists at {better}. {again}")
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
 
@@ -90,13 +91,13 @@ def solution_with_profile_intervals(
 
     The cost as a function of such a parameter is not quadratic, so a standard deviation does not describe it. The same
     holds for a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). If
-    the problem is too large for profiles, the solution is returned unchanged.
+    the problem is too large for profiles, the solution is unchanged. Notes of its `checks` state better fits.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
         return solution
     sizes = uncertainty.typical_parameter_magnitudes(problem, solution.x)
-    asked = {}
+    asked, better_fits = {}, list[str]()
     for name, entry in solution.parameters.items():
         size = sizes.get(name.split("[")[0], math.nan)
         small = entry.value < _SMALL_VALUE_FRACTION * size
@@ -111,12 +112,14 @@ def solution_with_profile_intervals(
         if entry.verdict != "not_identifiable" and not uncertainty.needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = uncertainty.apply_profile_interval(entry, profile.interval, size)
+            better_fits.extend(f"For {name}, {note}." for note in profile.notes if "better fit" in note)
         return entry
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"computing 95 % intervals of {', '.join(asked)}", 7.5 * len(asked), 5.2)
     found = apply_function_per_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
-    return replace(solution, parameters={**solution.parameters, **found})
+    checks = uncertainty.EstimateChecksBeyondFit(notes=tuple(better_fits)) if better_fits else solution.checks
+    return replace(solution, parameters={**solution.parameters, **found}, checks=checks)
 
 
 def apply_function_per_parameter_at_optimum(

@@ -371,7 +371,8 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
     `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
     std is infinite. Without open ends, the distance from the value to the farther end, divided by 1.96, decides the
-    verdict. It replaces std if std is less than half of it.
+    verdict. It replaces std if std is less than half of it. If it is less than half of std, refits may have ended in
+    local minima, so the interval is value ± 1.96 std.
     """
     order, (low, high) = ("identifiable", "weak", "not_identifiable"), interval
     if low is None and entry.value - entry.lower <= scale:
@@ -386,6 +387,9 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
         wide = max(entry.value - low, high - entry.value) / math.sqrt(CHI2_95_TWO_SIDED)
         std = wide if _MIN_COST_RISE_RATIO * wide > entry.std else entry.std
         found = min(verdict_by_relative_std(entry.value, wide, scale), "weak", key=order.index)
+        if wide < _MIN_COST_RISE_RATIO * std < math.inf:
+            reach = math.sqrt(CHI2_95_TWO_SIDED) * std
+            interval = max(entry.value - reach, entry.lower), min(entry.value + reach, entry.upper)
     said = max(entry.verdict, found, key=order.index) if entry.verdict in order else entry.verdict
     return replace(entry, std=std, verdict=said, interval=interval)
 
@@ -483,7 +487,8 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
     if explains:
         return f"The model explains the recordings to within their noise ({size})."
-    return f"The model does not explain the recordings ({size}). To find the cause, run `yid-ocp diagnose`."
+    said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
+    return f"{said} To find the cause, run `yid-ocp diagnose`."
 
 
 def value_and_uncertainty_text(
