@@ -269,13 +269,13 @@ def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, 
 
 def _late(samples: SensorMeasurements, speed: Array, path: Array, recording: str) -> Iterator[Issue]:
     """Yield an issue if the clock of points with the whitened `speed` is far later or earlier than the fit expects."""
-    if samples.change_by_clock is not None:
+    if samples.change_by_clock is not None and speed.any():
         seen, name = samples.positive_weight_mask, samples.sensor.group_name
         by_std, left = ((samples.weight * x)[seen] for x in (samples.change_by_clock, path - samples.value))
         stds, std = float(by_std @ left / (by_std @ by_std + 1)), float(np.linalg.norm(by_std) / np.linalg.norm(speed))
         size = f"{abs(stds) * std:.2g}"
-        what = f"the fit finds time stamps of {name} {size} s {'late' if stds > 0 else 'early'}, but expects "
-        what += f"{1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
+        what = f"the fit finds time stamps of {name} {1e3 * float(size):.2g} ms {'late' if stds > 0 else 'early'}, but "
+        what += f"expects {1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
         advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
         if (ratio := abs(stds) / _MIN_Z) > 1:
             line = f"sensors.{name}.clock_offset_std: {size}"
