@@ -168,7 +168,6 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
-    assert "It is the best of" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
     assert "holds for the configured initial values" in words
 

@@ -52,16 +52,14 @@ def test_a_run_on_good_recordings_says_nothing(damaged, carried_out):
 def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out):
     done = carried_out("solve", damaged(noisy))
     result = done.result
-    assert {doubt["cause"] for doubt in result["issues"]} == {"noise"}
-    assert not result["fit"]["data_trusted"]
+    assert ({doubt["cause"] for doubt in result["issues"]}, result["fit"]["data_trusted"]) == ({"noise"}, False)
     free = [entry for entry in result["parameters"].values() if entry["free"]]
     assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
     assert any(line.split("  ")[0] == "issue" for line in done.out.splitlines()[:6])
     for words in ("Use no value of a fit until this is corrected: ", "effort.std: 0.1", "is it an error?"):
         assert words in done.out
     page = (done.folder / "report.html").read_text()
-    assert "<h3>Issues of the recordings</h3>" in page
-    assert "a channel has more noise than stated" in page
+    assert all(text in page for text in ("<h3>Issues of the recordings</h3>", "a channel has more noise than stated"))
 
 
 def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
@@ -88,8 +86,7 @@ def test_strict_stops_a_run_in_doubt(printed, damaged, tmp_path, left_nothing, c
 
 def test_check_lists_what_is_in_doubt(carried_out, damaged):
     done = carried_out("check", damaged(noisy))
-    assert "a channel has more noise than stated" in done.out
-    assert "A run is possible" in done.out.splitlines()[0]
+    assert " ".join(done.out.split()).startswith("Do not run `solve` yet, because its values would be unusable: a cha")
 
 
 def test_times_that_are_not_seconds_stop_a_run_at_once(printed, damaged, tmp_path, left_nothing):

@@ -309,7 +309,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 cells.append("stopped" if method in stopped else text)
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield from misfit_summary_blocks(judged["fit"], {n: e for n, e in judged["parameters"].items() if e["free"]})
+    yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
     agree = "Use the column `solve`: all methods agree within their ± on the parameters that are found."
     objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)

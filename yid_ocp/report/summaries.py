@@ -30,6 +30,7 @@ from yid_ocp.report.terminal import (
     bound_range_text,
     copyable_estimates_blocks,
     discretisation_shift_sentences,
+    issue_descriptions,
     issue_summary_blocks,
     large_torque_offsets_sentence,
     misfit_summary_blocks,
@@ -58,15 +59,15 @@ _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an eq
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed, converged = result["status"] == "failed", result["status"] == "converged"
-    issues, is_trusted = issue_summary_blocks(result), result["fit"]["data_trusted"]
-    yield from () if is_trusted else issues
+    is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
+    yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
         predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
-        yield from misfit_summary_blocks(result["fit"], free, any("First set " in note for note in notes))
+        yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap: " in text for text in predicted)
         said = goodness_of_fit_message(result["fit"]["chi2_per_dof"], True) if result["fit"]["explains"] else ""
-        found, doubts = (*_found_and_lost(free, is_safe), said), (*notes, *predicted)
+        found, doubts = (*_found_and_lost(free, is_safe, mild), said), (*notes, *predicted)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
@@ -74,7 +75,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = f"Do not use the values, because {said}: {result['message'].removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
         yield SummaryStatement(said, "conclusion")
-    yield from issues if is_trusted else ()
+    is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
+    yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
     shown, heads = "value" if converged else "last value", ("± std", "95 % interval", "unit", "verdict", "start")
     rows: TableRows = [("parameter", shown, *heads, "bounds")]
     for name, entry in free.items():
@@ -108,12 +110,14 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     finer = [text for text in result.get("finer_settings", {}).values() if f"First set {text}," in notes]
     options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
+    if not result["fit"]["data_trusted"]:
+        steps["estimate again, after the advice above is followed"] = "solve"
     if not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
     if lost:
-        steps[f"rank experiments that determine {abbreviated_names_text(lost)}"] = "identifiability --what-if"
+        steps["rank experiments that determine what these do not"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
     return steps
@@ -212,12 +216,13 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     return [channel for channel in errors if channel not in hidden]
 
 
-def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool) -> Iterator[str]:
+def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str) -> Iterator[str]:
     found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
         text, names = f"{text} (near zero: of a typical value)", abbreviated_names_text(found)
-        yield f"Use these values within their ±: {names}. {text}." if is_safe else f"{text}: {names}."
+        once = f", once you have checked the issues below ({mild})" if mild else ""
+        yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
         none = "Use no value. " * (len(lost) == len(free))
         yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
@@ -228,12 +233,17 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool) -> Ite
 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
+    by_bound = dict[str, list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
-                what = f"{name} ended at its {side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
-                remedy = f"Widen parameters.{name}.bounds, or fix {name} there if the bound is a physical limit."
-                yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
+                bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
+                by_bound.setdefault(bound, []).append(name)
+    for bound, names in by_bound.items():
+        what, own = f"{abbreviated_names_text(names)} ended at the {bound}", names[0] if len(names) == 1 else "NAME"
+        remedy = f"Widen parameters.{own}.bounds, or fix {own} there if the bound is a physical limit."
+        yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
 
 
 @register_summary("yid-identifiability/1")
@@ -252,7 +262,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
-    yield from () if result["fit"] is None else misfit_summary_blocks(result["fit"], parameters)
+    yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
     said = f"{len(found)} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
@@ -263,6 +273,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
     legend = "unknown: the ± is infinite, or has no upper end. open: any value is possible. –: no value was found."
     yield legend if any("unknown" in row for row in rows) else ""
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
@@ -334,7 +345,9 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
-    yield next_steps_table(result, longer if not is_usable and said != done else {} if result["from"]["run"] else steps)
+    record = {"estimate from FILE, a recording of this motion": "solve --set recordings.estimate=[FILE]"}
+    steps = ({} if result["from"]["run"] else steps) | (record if result["goal"] == "information" else {})
+    yield next_steps_table(result, longer if not is_usable and said != done else steps)
 
 
 def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -380,11 +393,6 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for own in result["distances"]:
         rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
     yield SummaryTable(rows, "Effects")
-    starts, best = result["starts"], result["starts"][result["best"]]
-    gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
-    others = f" It is the best of {len(starts)} searches; the next has {gains[1]:.3g} nat." if len(gains) > 1 else ""
-    half = "(0.7 nat more halves one standard deviation)"
-    yield f"The motion has {best['judged']:.3g} nat of information {half}.{others}"
     reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
     yield f"The motion reaches {text}."
@@ -398,60 +406,55 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    issues, warnings = result.get("issues"), [*result["warnings"]]
-    misfit, moved = result["initial_misfit"], discretisation_shift_sentences(result)
+    warnings, misfit, moved = result["warnings"], result["initial_misfit"], discretisation_shift_sentences(result)
     is_far = misfit is not None and misfit > _MAX_INITIAL_MISFIT
     coarse = [] if is_far else result["convergence"]["warnings"]
-    ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
-    if result["recordings"]:
-        ended = f"No problem was found. Next: {result['command'].replace('yid-ocp check', 'yid-ocp solve')}"
-    if issues or warnings or coarse:
-        ended = f"A run is possible. First follow the advice on the {'issues' if issues else 'warnings'} below."
+    severe, mild = (issue_descriptions(result, severe=own) for own in (True, False))
+    ended, step = "No problem was found. `solve` can run.", "estimate the free parameters"
+    if not result["recordings"]:
+        ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
+    if severe:
+        ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
+    elif result.get("issues") or warnings or coarse:
+        ended = f"`solve` can run, but its estimates may be poor: read the {'issues' if mild else 'warnings'} below."
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."
     yield same if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (median)")]
-    rests = dict[str, list[str]]()
+    apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"
         for name, group in entry["groups"].items():
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
             rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
-        rest = entry.get("equilibrium")
-        said = [] if rest is None else ["the model is in equilibrium" if rest["found"] else rest["message"]]
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
-        said += ["hand and object are apart at grasp " + ", ".join(gaps)] if gaps else []
-        rests.setdefault(", and ".join(said), []).append(f"'{entry['recording']}'")
+        apart.setdefault(", ".join(gaps), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
-    for text, names in rests.items():
-        which = "all recordings" if 1 < len(names) == len(result["recordings"]) else ", ".join(names)
-        yield f"At the start of {which}, {text}." if text else ""
+    for text, names in apart.items():
+        said = f"At the start of {abbreviated_names_text(names)}, hand and object are apart at grasp {text}."
+        yield said if text else ""
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
         rows = [(head, "lowest natural frequencies [Hz]", "remark")]
         for row in convergence[key]:
-            remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
-            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
+            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), row["message"]))
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
-    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in coarse)
+    yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
     if is_far:
-        far = f"At the initial values (parameters.NAME.initial), the model error is {misfit:.0f} times the noise. "
-        far += "This is usual before a fit. `solve` also tests links and time step, which say little before the fit."
-        yield SummaryStatement(far, "verdict")
-    else:
-        fine = "Are links and time steps fine enough, at the initial values? (`solve` repeats this test.)"
-        yield from [fine, *moved] if moved else []
-    yield from issue_summary_blocks(result)
+        yield f"At the initial values, the model error is {misfit:.0f} times the noise, which is usual before a fit."
+    tested = "Links and time steps were tested at the initial values; `solve` repeats this test at its estimates."
+    yield from [tested, *moved] if moved and not is_far else ["`solve` tests links and time steps."] * is_far
+    yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:
         name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
-    next_step = {"estimate, if the advice above is followed": "solve"} if issues or warnings or coarse else {}
-    yield next_steps_table(result, next_step if result["recordings"] else {})
+    step += ", after the advice above is followed" * (not ended.startswith("No problem"))
+    yield next_steps_table(result, {step: "solve"} if result["recordings"] else {})
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
@@ -477,8 +480,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     values = {n: abs(result["parameters"][n]["value"]) for n in changes}
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
-    text = f"The recordings cannot determine {abbreviated_names_text(lost)} near these values: even if all else were "
-    text += f"known, the ± would exceed {MAX_WEAK_RELATIVE_STD:g} times the value."
+    text = f"At the initial values and starts of motion, the recordings tell nothing of {abbreviated_names_text(lost)} "
+    text += f"(± above {MAX_WEAK_RELATIVE_STD:g} times the value). `yid-ocp identifiability` tests this after a fit."
     every = "Every free parameter changes a reading."
     yield SummaryStatement(text if lost else every if changes else "", "verdict")
     radius = linear["spectral_radius"]

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
 
 TableRows = list[Sequence[str]]
-_MAX_ISSUES_PER_CAUSE = 3
+_MAX_REMEDIES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
-_MAX_NUMBERS_BEYOND_MODEL = 6  # parameters that a sentence on a poor fit lists; the table has all
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
@@ -102,25 +101,36 @@ def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, st
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
 
-def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield the issues of the recordings in a result as a table, with advice and settings for each."""
+def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
+    """Return the descriptions of the issues in a result that make its values unusable, or else of the others."""
+    shown = (entry for entry in result.get("issues") or () if (entry["severity"] != "warning") == severe)
+    return "; ".join(dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[entry["cause"]] for entry in shown))
+
+
+def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True) -> SummaryBlockOrTextIterator:
+    """Yield the issues of the recordings in a result as a table, with advice and settings for each cause."""
     issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in issues):
         alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
-        for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
-            left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
-            where = entry["where"] + f" and {left} more" * bool(left)
-            rows.append((words, where, entry["certainty"]))
-            do = entry["advice"][:1].upper() + entry["advice"][1:]
-            do += " by this line of the configuration:" if entry["setting"] else "."
-            place = f" ({where.partition('/')[0]})" if len(alike) > 1 else ""
-            advice += [f"{words}{place}: {entry['what']}. {do}", CodeBlock(entry["setting"])]
-    if severe := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] != "warning"):
-        yield SummaryStatement(f"Use no value of a fit until this is corrected: {'; '.join(severe)}.", "verdict")
-    if mild := dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[e["cause"]] for e in issues if e["severity"] == "warning"):
-        yield f"These issues change no verdict. Use values after you have followed the advice on: {'; '.join(mild)}."
+        by_remedy: dict[str, list[Mapping[str, Any]]] = {}
+        for entry in alike:
+            by_remedy.setdefault("setting" if entry["setting"] else entry["advice"], []).append(entry)
+        parts = list(by_remedy.values())
+        last = [entry for part in parts[_MAX_REMEDIES_PER_CAUSE - 1 :] for entry in part]
+        for first, *others in filter(None, [*parts[: _MAX_REMEDIES_PER_CAUSE - 1], last]):
+            where, do = first["where"] + f" and {len(others)} more" * bool(others), first["advice"]
+            rows.append((words, where, first["certainty"]))
+            # the first issue is the strongest; its line counts if others give the same setting another value
+            lines = {own["setting"].partition(":")[0]: own["setting"] for own in (*others[::-1], first)}
+            do += f" by {'these lines' if len(lines) > 1 else 'this line'} of the configuration:" if all(lines) else "."
+            text = f"{words}{f' ({where})' * (len(alike) > 1)}: {first['what']}. {do[0].upper()}{do[1:]}"
+            advice += [text, CodeBlock("\n".join(lines.values()))]
+    if (severe := issue_descriptions(result, severe=True)) and with_verdict:
+        yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
+    if (mild := issue_descriptions(result, severe=False)) and with_verdict:
+        yield f"The verdicts do not account for these issues, so follow their advice before you use values: {mild}."
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
 
@@ -153,31 +163,28 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
 
 
 def misfit_summary_blocks(
-    fit: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]], is_coarse: bool = False
+    result: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]], is_coarse: bool = False
 ) -> SummaryBlockOrTextIterator:
     """Yield statements on a poor fit: misfit, parameters that are still meaningful, channels worse than a baseline.
 
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value, and
     the model is not `is_coarse`: finer links or time steps explain the recordings no better.
     """
+    fit = result["fit"]
     if not fit["explains"]:
         said = uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False)
-        yield SummaryStatement("Do not use the values yet. " * is_coarse + said, "conclusion")
-        doubted = {name: entry for name, entry in parameters.items() if entry["verdict"] == "not_trusted"}
-        if doubted and fit["data_trusted"] and not is_coarse:
-            known = []
-            for name, entry in doubted.items():
-                relative = entry.get("std_relative")
-                std = entry["std"] if "std" in entry else relative and relative * abs(entry["value"])
-                if std is not None and std <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry["value"]):
-                    value = uncertainty.value_and_uncertainty_text(entry["value"], std, None)
-                    known.append(f"{name} = {value} {entry['unit']}")
-            left = len(known) - _MAX_NUMBERS_BEYOND_MODEL
-            shown = ", ".join(known[:_MAX_NUMBERS_BEYOND_MODEL]) + (f" and {left} more" if left > 0 else "")
-            none = "Do not use the values, because none is known to within 10 % if ± includes the model error."
-            said = f"Use these values only if `yid-ocp diagnose` finds no effect (± includes the model error): {shown}."
-            yield SummaryStatement(said if known else none, "conclusion")
-    texts, worse = list[str](), fit.get("worse_than_guess", ())
+        first = "First make the model finer, as follows." if is_coarse else "First follow the advice on the issues."
+        said = f"{said.partition(' To find')[0]} {first}" if is_coarse or not fit["data_trusted"] else said
+        yield SummaryStatement(said, "conclusion")
+        stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
+        values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
+        limit, doubted = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD, fit["data_trusted"] and not is_coarse
+        known = [name for name, std in stds.items() if std is not None and std <= limit * values[name]]
+        said = f"Until then, treat these values as rough: {abbreviated_names_text(known)}. Their ± is at most 10 % and "
+        said += "includes the model error, but an effect that the model lacks can shift them further."
+        yield SummaryStatement(said if known and doubted else "", "conclusion")
+    causes, texts = [entry["cause"] for entry in result.get("issues", ())], list[str]()
+    worse = () if "worse_than_guess" in causes else fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} by '{entry['baseline']}'")
@@ -192,32 +199,32 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in free.items()}
     again, wide = (", and solve again", " The ± of the table includes this.") if free else ("", "")
     kinds = {"links": "twice the links", "time_step": "half the time step"}
-    kinds["encoder_noise"] = "encoder noise of the stated size added once more"
-    limits = " This assumes that the noise is as stated (sensors.joints.position.std), and tests for no other error."
-    found = {} if result.get("status") in ("stalled", "iteration_limit") else result.get("discretisation", {})
+    kinds["encoder_noise"] = "encoder noise (sensors.joints.position.std) added once more"
+    quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
+    found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
-        tried = {name: own for name, own in found.items() if own.get(key) is not None}
-        moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
+        tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
+        moved = {name: own for name, own in tried.items() if abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
         changes = [f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} (± {moved[n]['std']:.2g})" for n in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}")
-        elif any(own["std"] is not None for own in tried.values()):
+        elif tried:
             is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
-            end = ", although the errors would fall." if is_noted else "." + limits * (key == "encoder_noise")
-            said.append(f"With {words}, no estimate would change by more than its ± from the recordings{end}")
+            quiet.append(words + " (although the errors would fall)" * is_noted)
+    if quiet:
+        said.append(f"With {' or '.join(quiet)}, no estimate would change by more than its ± from the recordings.")
     return said + ([f"To reduce these errors, set {' and '.join(cures)}{again}."] if cures else [])
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
-    """Return a sentence on the sizes of torque offsets, relative to those that are expected. Empty without offsets."""
-    every = [pair for entry in result.get("torque_offsets", {}).values() for pair in entry.items()]
-    large = dict.fromkeys(joint for joint, own in every if abs(own["value"]) > 2 * own["prior_std"])
-    said = f"The torque offset of {', '.join(large)} is" if large else "No torque offset is"
-    do = " Check the calibration of the torque sensor." * bool(large)
-    return f"{said} over twice the expected size. The estimates take the offsets into account.{do}" if every else ""
+    """Return a sentence on torque offsets that are larger than expected. Empty without such offsets."""
+    offsets = result.get("torque_offsets", {}).values()
+    large = dict.fromkeys(j for own in offsets for j, e in own.items() if abs(e["value"]) > 2 * e["prior_std"])
+    said = f"The torque offset of {', '.join(large)} is over twice the expected size. The estimates take the offsets "
+    return said + "into account. Check the calibration of the torque sensor." if large else ""
 
 
 def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -136,7 +137,6 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         torque = episode.torque[0] if system.driven else None
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
         rest = problem.model_functions.equilibrium_solver.solve(episode.initial_known_coordinates, theta, torque)
-        entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"for '{episode.name}' with the initial parameters, {rest.message}")
     entry["grasp_gaps"] = min_grasp_gaps_at_start(problem, episode)
@@ -198,11 +198,17 @@ def _moves(
     shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
         problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
     )
-    coarse += notes
     # the misfit of initial values does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
-    return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
+    found = discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
+    # frequencies that change do not matter if the estimates stay
+    for kind, words in (("links", "the number of links"), ("time_step", "the time step")):
+        known = [own for own in found.values() if own[kind] is not None and 0 < own["std"] < math.inf]
+        if max((abs(own[kind]) / own["std"] for own in known), default=math.inf) < 1:
+            coarse[:] = [text for text in coarse if f"when {words} goes" not in text]
+    coarse += notes
+    return found
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:

@@ -142,7 +142,8 @@ class _RemainingTime:
         """
         if self._has_grown:
             return f", {time.monotonic() - self._start_of_command:.0f} s so far"
-        return "" if math.isnan(seconds := self.seconds_left()) else f", about {_format_duration(seconds)} left"
+        is_known = (seconds := self.seconds_left()) >= _MIN_ESTIMATE_TIME  # not if NaN
+        return f", about {_format_duration(seconds)} left" if is_known else ""
 
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,9 +55,7 @@ def _run_inspect(
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.begin_stage("building the model and its compiled step")
-        begun = time.perf_counter()
         step = build_step(run)
-        seconds = time.perf_counter() - begun
         symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
         # check names before anything slow; parameter names have no brackets
         named = [text for text in map(str.strip, entries) if text and not set(text) & set("[,")]
@@ -83,8 +80,6 @@ def _run_inspect(
         at = _columns_at(step, point) if chosen else np.zeros(0)
         result = {
             "format": "yid-inspect/1",
-            "build_seconds": seconds,
-            "compiled": step.is_compiled,
             "variables": [
                 {"name": joint.name, "unit": joint.coordinate_unit, "role": roles.get(joint.name, "free")}
                 for joint in step.system.mechanism.joints
@@ -102,7 +97,6 @@ def _run_inspect(
             "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
                 "at": point.description,
-                "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},
                 "spectral_radius": float(np.max(np.abs(np.linalg.eigvals(matrices["A"])), initial=0.0)),
             },
             "asked": named,
