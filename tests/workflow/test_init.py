@@ -135,7 +135,7 @@ def test_the_first_lines_of_the_readme_run_as_printed(bench: Path, repository: P
 def test_a_page_shows_what_was_guessed_before_the_fit(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Arm, unbent object and markers in motion, markers under the names of their frames, so that lines join the two."""
     assert init(*CABLE) == 0
-    assert "check these choices in the picture run.html." in capsys.readouterr().out
+    assert "Check them in the picture run.html:" in capsys.readouterr().out
     page = Path("run.html").read_text()
     [scene] = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
     model, measured = scene["scenes"][0]["motions"]
@@ -520,7 +520,7 @@ def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.Captur
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert " in the world frame?" in capsys.readouterr().out
+    assert ": check --length and --point-frame" in capsys.readouterr().out
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2

@@ -346,7 +346,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not found:
-        yield "No parameter can be found from these recordings, so there is nothing to agree on."
+        yield "Use no value, because these recordings determine no parameter on which the methods could agree."
     elif not result["agree"] and not result["disturbed"]:
         yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
 

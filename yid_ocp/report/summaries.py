@@ -117,7 +117,7 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     elif len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
     if lost:
-        steps["rank experiments that determine what these do not"] = "identifiability --what-if"
+        steps["rank experiments that determine the missing parameters"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
     return steps
@@ -287,7 +287,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if (asked := result["what_if"]) is not None:
         said = "No set of up to three changes makes it possible to find all parameters."
         if asked["smallest"]:
-            said = f"The fewest changes with which all parameters can be found: {asked['smallest'][0]['words']}."
+            said = f"Record again with the fewest changes that determine all: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
         rows = [("change", "parameters found", "gain [nat]")]
         yield "Gain: information on all parameters. 0.7 nat more halves the standard deviation of one parameter."

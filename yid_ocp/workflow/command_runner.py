@@ -142,8 +142,7 @@ class _RemainingTime:
         """
         if self._has_grown:
             return f", {time.monotonic() - self._start_of_command:.0f} s so far"
-        is_known = (seconds := self.seconds_left()) >= _MIN_ESTIMATE_TIME  # not if NaN
-        return f", about {_format_duration(seconds)} left" if is_known else ""
+        return f", about {_format_duration(left)} left" if (left := self.seconds_left()) >= _MIN_ESTIMATE_TIME else ""
 
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual

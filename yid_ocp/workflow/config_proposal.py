@@ -422,7 +422,7 @@ def _near(
         branch = branches[0]
         part = float(np.linalg.norm(from_holder, axis=1).max()) / branch.length
         if part > 1.2:
-            return "", f"it is {part:.1f} object lengths away from {holder}. Is it on the object, in the world frame?"
+            return "", f"it is {part:.1f} object lengths away from {holder}: check --length and --point-frame"
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded

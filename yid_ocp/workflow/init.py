@@ -202,16 +202,17 @@ def _summary_lines(
         if "." not in group and own and not any(place.frame for place in own):
             frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
             lost.append(f"warning: `check` will stop, because no point of {group} has a frame. Set {frames} or {use}")
-    lines = [*lost, "`init` chose:", *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
+    where = f" in the picture {out.with_suffix('.html')}" * has_picture
+    head = f"`init` chose these settings. Check them{where}:"
+    lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
-    picture = [f"Please check these choices in the picture {out.with_suffix('.html')}."] if has_picture else []
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
         lines.append(f"`diagnose` cannot test these effects, because no signal shows them: {', '.join(kinds)}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "
     unseen += "`diagnose` find friction and payload of the arm too, set sensors.joints.effort.use: true."
-    lines += [*[unseen] * is_left_out, *picture, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
+    lines += [*[unseen] * is_left_out, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" if is_left_out else ""
         lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
