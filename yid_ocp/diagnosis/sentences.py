@@ -293,7 +293,4 @@ def _remains(result: DiagnosisResult) -> list[str]:
         changes.append((abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9), text))
     ranked = sorted(changes, key=lambda own: -own[0])
     moved = listed([text for change, text in ranked if change > _MIN_RELATIVE_CHANGE], max_entries=_MAX_NAMED)
-    return [
-        " ".join(said),
-        *_said((moved, f"With the effects in the model, these estimates change: {moved}.")),
-    ]
+    return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]

@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
-from yid_ocp.errors import ConfigError, YidError, import_optional
+from yid_ocp.errors import YidError
 from yid_ocp.inference import linearized_residual
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import (
@@ -41,9 +41,6 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.initial_guess import start_vectors_toward_other_minima, unknowns_with_neutral_effects_activated
-
-if TYPE_CHECKING:
-    import pandas
 
 log = logging.getLogger(__name__)
 
@@ -159,18 +156,6 @@ class Solution(ReprMixin):
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
-
-    def parameters_to_dataframe(self) -> pandas.DataFrame:
-        """Convert the parameters to a pandas data frame: value, std, lower, upper, unit, verdict, free, initial.
-
-        `lower` and `upper`: the 95 % interval, infinite at an open end. `value` is NaN if it cannot be found.
-        """
-        pandas = import_optional("pandas", "pandas", "a data frame needs the package pandas", ConfigError)
-        columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
-        for name, e in sorted(self.parameters.items(), key=lambda entry: not entry[1].free):
-            value = math.nan if e.verdict == "not_identifiable" else e.value
-            rows[name] = (value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
-        return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
 IterationCallback = Callable[[Iterate], None]

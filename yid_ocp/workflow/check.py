@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -201,14 +200,8 @@ def _moves(
     # the misfit of initial values does not predict the uncertainty after a fit
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
-    found = discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
-    # frequencies that change do not matter if the estimates stay
-    for kind, words in (("links", "the number of links"), ("time_step", "the time step")):
-        known = [own for own in found.values() if own[kind] is not None and 0 < own["std"] < math.inf]
-        if max((abs(own[kind]) / own["std"] for own in known), default=math.inf) < 1:
-            coarse[:] = [text for text in coarse if f"when {words} goes" not in text]
     coarse += notes
-    return found
+    return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
