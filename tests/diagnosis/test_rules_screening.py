@@ -96,8 +96,7 @@ def test_scores_scatter_with_the_encoders_noise_that_moves_an_arm(urdf_folder, h
     "kind, place, rotor",
     {
         "gain": ("effort_gain", "joint", False),
-        "lag": ("effort_lag", "joint", False),
-        "beside a free inertia": ("effort_lag", "joint", True),
+        "beside a free inertia": ("effort_gain", "joint", True),
         "load beside a free inertia": ("point_mass", "weight", True),
     },
 )
