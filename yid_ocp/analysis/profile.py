@@ -78,9 +78,10 @@ def compute_profile_likelihood_interval(
     deltas = np.array([point.chi2 for point in points]) - walk.base
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
-        better = f"{values[np.argmin(deltas)]:.4g} (chi2 lower by {-walk.base:.2g}), so no value is the best one"
-        again = f"Repeat `yid-ocp solve` with --set parameters.{name.partition('[')[0]}.initial={better.split()[0]}"
-        walk.notes.append(f"a better fit exists at {better}. {again}")
+        best = f"{values[np.argmin(deltas)]:.4g}"
+        better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so no value is the best one"
+        again = f"Repeat `yid-ocp solve` with --set parameters.{name.partition('[')[0]}.initial={best}"
+        walk.notes.append(f"{better}. {again}")
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
 

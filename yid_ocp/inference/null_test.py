@@ -328,10 +328,9 @@ def held_out_gap_closure(before: HeldOutLoss, after: HeldOutLoss) -> HeldOutGapC
 
     Kuensch 1989, doi:10.1214/aos/1176347265.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = 1 - float(np.divide(after.excess_chi2_per_sample, before.excess_chi2_per_sample))
-    if not math.isfinite(fraction):
+    if before.excess_chi2_per_sample <= 0 or not math.isfinite(after.chi2_per_sample):
         return UNDEFINED_GAP_CLOSURE
+    fraction = 1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample
     count = len(before.block_sample_counts)
     draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
     n = before.block_sample_counts[draws].sum(axis=1)

@@ -17,7 +17,7 @@ from yid_ocp.errors import DataError
 
 _MIN_CUTOFF_FRACTION = 1e-4  # of half the sampling rate; below it, the filter's sections are numerically singular
 _FILTER_ORDER = 4
-_SLOW_EFFORT_CUTOFF_FRACTION = 0.25
+_SLOW_EFFORT_CUTOFF_FRACTION = 0.25  # of the path cutoff
 _MIN_RELATIVE_WEIGHT = 1e-4  # fraction of the largest weight below which weights are dropped in the filter's matrix
 
 
@@ -122,7 +122,7 @@ def _weights(low_pass: ZeroPhaseLowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)  # two for each of eight recordings
 def _smoothing_matrix(
     low_pass: ZeroPhaseLowPassFilter, nodes: tuple[int, ...], count: int, step: float
 ) -> scipy.sparse.csr_array:
@@ -209,7 +209,9 @@ class FirstOrderLag:
         passed[2:] *= 1 - share
         passed[1:-1] += (share - decay) * back[2:]
         passed -= rates.T @ (lead * pull)
-        return passed if self.slow_part is None else pull + self.slow_part.smoothing_adjoint(passed - pull), direct
+        if self.slow_part is not None:
+            passed = pull + self.slow_part.smoothing_adjoint(passed - pull)
+        return passed, direct
 
     def _slow(self, value: Array) -> Array:
         return value if self.slow_part is None else self.slow_part.smooth(value)
