@@ -189,7 +189,8 @@ def test_the_low_pass_lies_above_motion_that_exceeds_the_noise_of_the_encoders(b
 def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fixed = '<link name="{0}"/><joint name="{0}" type="fixed"><parent link="hub"/><child link="{0}"/></joint></robot>'
     # of two last frames none is: the frame that carries both
-    for end, holder, others in (("mount", "mount", "hub"), ("finger", "hub", "finger, mount")):
+    frames = ("mount", "mount", "hub"), ("finger", "hub", "finger, mount"), ("grip", "grip", "hub, finger, mount")
+    for end, holder, others in frames:
         (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", fixed.format(end)))
         assert proposed(moved(SHORT)).model.object.mount.parent_frame == holder
         assert f"object held by: {holder} (other frames for --holder: {others})" in capsys.readouterr().out

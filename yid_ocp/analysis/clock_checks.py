@@ -45,6 +45,7 @@ _MAX_DRIFT = 0.05  # largest relative drift of clocks that should agree
 _DRIFT_SEARCH_STEP = 0.2  # difference of the total drift between two trials [s]
 _N_RELINEARIZATIONS = 3  # repetitions of a fit at the corrected times
 _MAX_CLOCK_SHIFT_Z = 2.0  # stated standard deviations by which a clock may be off without an issue
+_MAX_CLOCK_RESIDUE = 0.5  # rms error of a corrected path per noise, which adds a quarter to chi2 per degree of freedom
 _MIN_EXPLAINED_FRACTION = 0.5  # fraction of the residual beyond noise that a drift must explain
 # Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
@@ -89,8 +90,7 @@ def _clock_error(
     inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
     found = inverse @ (rows.T @ target)
     remains = target - rows @ found
-    plain = rows[:, 2:]
-    base = target - plain @ np.linalg.lstsq(plain, target, rcond=None)[0]
+    base = target - rows[:, 2:] @ np.linalg.lstsq(rows[:, 2:], target, rcond=None)[0]
     after, before = (float(np.sum(x[:data] ** 2)) for x in (remains, base))
     block = np.clip(((t - span[0]) / length * _N_TIME_BLOCKS).astype(int), 0, _N_TIME_BLOCKS - 1)
     scores = np.zeros((_N_TIME_BLOCKS, rows.shape[1]))
@@ -267,18 +267,17 @@ def clock_and_noise_issues_from_residuals(problem: EstimationProblem, x: Array, 
     return [issue for issue in found if (issue.cause, issue.recording, issue.group) not in known]
 
 
-def _late(samples: SensorMeasurements, speed: Array, path: Array, recording: str) -> Iterator[Issue]:
-    """Yield an issue if the clock of points with the whitened `speed` is far later or earlier than the fit expects."""
+def _late(samples: SensorMeasurements, speed: Array, bend: Array, path: Array, recording: str) -> Iterator[Issue]:
+    """Yield an issue if the clock of points is too late or early for a correction by `speed`, as the path bends."""
     if samples.change_by_clock is not None and speed.any():
-        seen, name = samples.positive_weight_mask, samples.sensor.group_name
-        by_std, left = ((samples.weight * x)[seen] for x in (samples.change_by_clock, path - samples.value))
-        stds, std = float(by_std @ left / (by_std @ by_std + 1)), float(np.linalg.norm(by_std) / np.linalg.norm(speed))
-        size = f"{abs(stds) * std:.2g}"
-        what = f"the fit finds time stamps of {name} {1e3 * float(size):.2g} ms {'late' if stds > 0 else 'early'}, but "
-        what += f"expects {1e3 * std:.2g} ms ({_MIN_Z:g} times this is tolerated)"
+        left, name = (samples.weight * (path - samples.value))[samples.positive_weight_mask], samples.sensor.group_name
+        late = float(speed @ left / (speed @ speed))
+        error = 0.5 * late**2 * float(np.sqrt(np.mean(bend**2)))
+        what = f"the fit finds time stamps of {name} {1e3 * abs(late):.2g} ms {'late' if late > 0 else 'early'}. Its "
+        what += f"linear correction leaves {error:.2g} times the noise ({_MAX_CLOCK_RESIDUE:g} is tolerated)"
         advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
-        if (ratio := abs(stds) / _MIN_Z) > 1:
-            line = f"sensors.{name}.clock_offset_std: {size}"
+        if (ratio := error / _MAX_CLOCK_RESIDUE) > 1:
+            line = f"sensors.{name}.clock_offset_std: {abs(late):.2g}"
             yield Issue("clock_offset", what, "warning", ratio, advice, recording, name, "t", setting=line)
 
 
@@ -300,11 +299,11 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             at, t = slice(slices[k].start - own.start, slices[k].stop - own.start), times[own]
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
-            speed = _by_lateness(problem, x, i, samples, result)[samples.positive_weight_mask]
-            yield from _late(samples, speed, result.predicted_outputs[k], episode.recording.name)
+            path, seen = result.predicted_outputs[k], samples.positive_weight_mask
+            speed, bend = (rates[seen] for rates in _by_lateness(problem, x, i, samples, result, path))
+            yield from _late(samples, speed, bend, path, episode.recording.name)
             columns[at, 1:] = _by_clock(t[at], speed, span)
-            whitening = problem.whitening_filters[i]
-            if whitening is not None:
+            if (whitening := problem.whitening_filters[i]) is not None:
                 columns = whitening.whiten_residuals_and_estimate_torque_bias(columns, None)[0]
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
             error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
@@ -314,15 +313,15 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
 
 
 def _by_lateness(
-    problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction
-) -> Array:
-    """Return the derivative (M, k) of whitened prediction minus measurement by the lateness [s] of the time stamps."""
+    problem: EstimationProblem, x: Array, i: int, samples: SensorMeasurements, result: EpisodePrediction, path: Array
+) -> tuple[Array, Array]:
+    """Return the first and second derivative (M, k) of whitened predictions by the lateness [s] of the time stamps."""
     theta, state = problem.theta_of_episode(x, i), result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameter_names)))
-    steps, read = np.ones(samples.value.shape[1]), problem.predictor.readings_and_sensitivities
-    moved = (samples.shifted_earlier_by_delays(s * steps) for s in (-1.0, 1.0))
+    step, read = problem.step.time_step, problem.predictor.readings_and_sensitivities
+    moved = (samples.shifted_earlier_by_delays(np.full(path.shape[1], s)) for s in (-1.0, 1.0))
     ahead, behind = (read(own, state, none, theta)[0] for own in moved)
-    return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))
+    return samples.weight * (ahead - behind) / (2 * step), samples.weight * (ahead - 2 * path + behind) / step**2
 
 
 def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:

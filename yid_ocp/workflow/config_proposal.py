@@ -23,7 +23,7 @@ from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import RecordedChannelSpec, channel_specs_for_group_name
 from yid_ocp.sensors.joints import is_noise_std_stated
 
-_TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
+_TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "grip", "flange", "hand", "link8")
 """Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]

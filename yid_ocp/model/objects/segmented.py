@@ -47,7 +47,7 @@ class _SegmentGeometry:
     has_separate_twist_damping: Annotated[bool, OptionInfo("whether twists have their own damping parameter")] = False
     values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether its first end is clamped by a rigid wall or gripper")] = False
-    joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
+    joint_axes: Annotated[str, OptionInfo("rotation axes, base to tip; others are rigid (no z: no twist)")] = "xyz"
     has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
 
     def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:

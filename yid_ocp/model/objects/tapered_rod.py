@@ -49,7 +49,7 @@ class _TaperedRod(MountedObjectBuilder):
     base_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the base", "m")]
     tip_radius: Annotated[float, Gt(0), Le(5), OptionInfo("radius at the tip", "m")]
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
-    joint_axes: Annotated[str, OptionInfo("rotation axes of a joint, base to tip; other axes are rigid")] = "xyz"
+    joint_axes: Annotated[str, OptionInfo("rotation axes, base to tip; others are rigid (no z: no twist)")] = "xyz"
 
     def segment_definitions(self, damping: float = 0.0, link_division: int = 1) -> list[FlexibleSegment]:
         """Define the rod as one segment with the radius of its base. `build` then tapers the links."""
