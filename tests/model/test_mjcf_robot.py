@@ -204,10 +204,10 @@ def test_constants_of_joints_come_into_the_model_unless_the_settings_have_others
     assert found["rotor_inertia@joint1.armature"] == 0.1
     assert (found["joint1.damping"], joint_damping_and_friction(tmp_path / "robot.xml")[0]["joint2"]) == (1.0, 1.0)
     assert (found["joint1.servo_gain"], found["joint1.servo_damping"]) == (100.0, 10.0)
-    found = values("servo.xml", "{joints: [pan, lift], mode: prescribed}", "  damping: {pan: 0.3, lift: 0.2}\n")
-    assert found["joint_coulomb@pan.tau_c"] == 0.05
-    assert found["rotor_inertia@lift.armature"] == 0.028
-    assert found["pan.damping"] == 0.3
+    more = "  damping: {pan: 0.3, lift: 0.2}\n  friction: {law: presliding, joints: [lift]}\n"
+    found = values("servo.xml", "{joints: [pan, lift], mode: prescribed}", more)
+    assert (found["joint_coulomb@pan.tau_c"], found["rotor_inertia@lift.armature"]) == (0.05, 0.028)
+    assert (found["pan.damping"], "joint_coulomb@lift.tau_c" in found) == (0.3, False), "a law replaces dry friction"
     more = "  effects:\n    - {kind: rotor_inertia, location: pan}\n"
     more += "    - {kind: rotor_inertia, location: lift, values: {armature: 0.5}}\n"
     more += "parameters:\n  joint_coulomb@pan.tau_c: {initial: 0.2}\n"

@@ -242,7 +242,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
 
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:
-    """The system with armature, dry friction and servos of an MJCF file; values in the settings override these."""
+    """The system with armature, dry friction and servos of an MJCF file; settings and a friction law override these."""
     present = {f"{said.kind}@{said.location}" for said in run.model.effects if said.values}
     kinds = {"armature": ("rotor_inertia", "armature"), "frictionloss": ("joint_coulomb", "tau_c")}
     for joint, own in _robot_file_constants(run).items():
@@ -252,7 +252,8 @@ def _with_robot_file_constants(run: RunSettings, system: System) -> System:
         for key in kinds.keys() & own.keys():
             kind, parameter = kinds[key]
             name = f"{kind}@{joint}"
-            if f"{name}.{parameter}" not in system.parameters:
+            is_replaced_by_law = key == "frictionloss" and joint in friction_joint_names(run, system)
+            if f"{name}.{parameter}" not in system.parameters and not is_replaced_by_law:
                 system = system.with_effects([make_effect(kind, joint, system)])
             values |= {f"{name}.{parameter}": own[key]} if name not in present else {}
         values = {name: value for name, value in values.items() if name in system.parameters}
