@@ -110,7 +110,7 @@ def _gauss_newton_step_in_finer_model(
     weighted = any(own is not None for own in coarse.whitening_filters)
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
-    if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
+    if (model_difference_only or weighted) and own.measurements != other.measurements:
         return "the finer model would use other samples of the recordings"
     is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
@@ -121,7 +121,7 @@ def _gauss_newton_step_in_finer_model(
         problem, point, jacobian = coarse, x, at_x.jacobian
         residual = np.concatenate([residual[other.data], at_x.residual[other.data.stop :]])
     if model_difference_only:
-        residual = residual - at_x.residual
+        residual = np.pad(residual[own.data] - at_x.residual[other.data], (0, len(residual) - own.data.stop))
     assert jacobian is not None
     scale = problem.unknown_scales
     low, high = ((bound - point) / scale for bound in problem.bounds)

@@ -24,6 +24,7 @@ from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
+    EffectSearchRecord,
     NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
@@ -186,7 +187,7 @@ def _restarted(
     seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore = NO_REFIT_STORE
 ) -> _Examined:
     """The nominal model, examined again on another problem; `seen` tells what has been changed before."""
-    search = seen.search.restarted_with(problem, store)
+    search = replace(seen.search, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
     told = seen.truncated, seen.is_corrected_for_links, seen.removed
     return _examined(search, _fitted_nominal_model(search, start), *told)
 

@@ -150,10 +150,6 @@ class RefitContext:
     # effects that are refitted in one round, and the number of refits, likewise
     rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)
 
-    def restarted_with(self, problem: AllCandidatesProblem, store: RefitStore = NO_REFIT_STORE) -> RefitContext:
-        """Return a context for another problem, without the results that are stored or recorded for the one before."""
-        return replace(self, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
-
     def record_stage_end_time(self, name: str) -> None:
         """Record that a stage ends now."""
         self.stage_ends[name] = time.perf_counter()

@@ -399,7 +399,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputRe
             t = times_since_recording_start(episode, samples)
             place = np.full(samples.positive_weight_mask.shape, -1)
             place[samples.positive_weight_mask] = np.arange(rows.start, rows.stop)
-            autocorrelation = _noise_autocorrelation(samples.smoothing_filter, episode.grid.time_step)
+            autocorrelation = _noise_autocorrelation(samples.smoothing_filter, episode.grid.time_step, samples.node)
             for column, channel in enumerate(samples.channel_name_per_output):
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
@@ -430,13 +430,13 @@ def newey_west_covariance_of_scores(columns: Array, residual: Array, series: Seq
     return total
 
 
-def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float) -> Array:
-    """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s] and thinned."""
-    if low_pass is None or not np.isfinite(low_pass.cutoff):
+def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float, nodes: IntArray) -> Array:
+    """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s], at some nodes."""
+    if low_pass is None or not np.isfinite(low_pass.cutoff) or len(nodes) < 2:
         return np.ones(1)
     half = int(2 * low_pass.passes / (low_pass.cutoff * step)) + 10
     impulse = np.zeros((2 * half + 1, 1))
     impulse[half] = 1.0
     response = low_pass(step * np.arange(2 * half + 1, dtype=float), impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
-    return np.asarray(full[:half] / full[0])[:: low_pass.decorrelation_stride_for_step(step)]
+    return np.asarray(full[:half] / full[0])[:: int(np.median(np.diff(nodes)))]

@@ -218,7 +218,7 @@ class _State:
 
 
 def _filtered(variance: Mapping[SmoothedUnknownGroup, float], model: ResidualStateSpaceModel) -> _Filtered:
-    return _forwards(model, model.prior_variances_of_unknowns(variance))
+    return _forwards(model, np.array([variance[group] for group in model.unknown_groups]) + model.torque_noise_variance)
 
 
 def _run(models: _Models, variance: _Variances) -> _State:

@@ -13,7 +13,7 @@ of later steps is linear in the number of intervals.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -225,10 +225,6 @@ class ResidualStateSpaceModel:
     initial_state_std: Array  # remaining error of the first state, shape (ns,)
     interval_correlation: float  # correlation of an unknown with its value one interval later
     torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
-
-    def prior_variances_of_unknowns(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
-        """Compute prior variances (nd,) of the unknowns in `reference_std`^2, as group variance plus torque noise."""
-        return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
 def residual_models_with_smoother_unknowns(

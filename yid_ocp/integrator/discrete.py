@@ -288,7 +288,8 @@ def _constraint(system: System, at: _Symbols, middle: Kinematics) -> tuple[ca.SX
     if relaxation is not None:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    return ca.densify(closure - system.constraint_compliance_diagonal() * at.lam / at.h), gain
+    compliances = (grasp.compliance for grasp in system.grasps for _ in range(grasp.n_constraint_equations))
+    return ca.densify(closure - ca.vertcat(ca.SX(0, 1), *compliances) * at.lam / at.h), gain
 
 
 def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:

@@ -445,10 +445,6 @@ class System(ReprMixin):
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
         return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
-    def constraint_compliance_diagonal(self) -> ca.SX:
-        """Return the constraint compliances (m, 1), the diagonal of C in phi(q_{k+1}) = C lam_k / h."""
-        return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
-
 
 def _check_names(
     tree: Mechanism, grasps: Sequence[Grasp], driven: Sequence[str], prescribed: Sequence[str], points: Sequence[str]

@@ -333,6 +333,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
+        max(1, round(options.sampling_time_step / grid.time_step)),
         zero_phase_effort_filter(options.path_cutoff),
         ZeroPhaseLowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),

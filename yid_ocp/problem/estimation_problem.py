@@ -358,19 +358,22 @@ class EstimationProblem(ReprMixin):
     def with_time_step(self, time_step: float) -> EstimationProblem:
         """Return a problem with another time step [s], without whitening filters and held-out recordings.
 
-        Initial states, guesses of equilibria and gear loads are copied from this problem.
+        Initial states, guesses of equilibria and gear loads are copied from this problem. A fraction of the time step
+        keeps the samples of filtered signals.
         """
         functions = self.model_functions.with_time_step(time_step)
+        options = replace(self.options, sampling_time_step=max(self.options.sampling_time_step, self.step.time_step))
 
         def placed(episode: Episode) -> Episode:
-            made = prepare_episode(functions, episode.recording, self.options, self.theta, self.free)
+            made = prepare_episode(functions, episode.recording, options, self.theta, self.free)
             loads, times = made.joint_loads.copy(), (made.grid.node_times, episode.grid.node_times)
             for column, known in zip(loads.T, episode.joint_loads.T, strict=True):
                 column[:] = np.interp(*times, known)
             start = {name: getattr(episode, name) for name in ("fixed_initial_state", "equilibrium_guess")}
             return replace(made, joint_loads=loads, **start)
 
-        return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
+        made = self._changed(model_functions=functions, options=options)
+        return made.with_episodes(list(map(placed, self.episodes)), ())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """Return a problem with other options, prepared anew from its recordings."""

@@ -94,6 +94,8 @@ class ProblemOptions:
         Model with divided links, required to check `links`.
     cable_vertices : CableVertices, optional
         Topology of a cable held by clamps, for its baselines.
+    sampling_time_step : float
+        Time step whose nodes give the samples of filtered signals, if it exceeds the time step [s].
     """
 
     initial_state: Annotated[
@@ -165,6 +167,7 @@ class ProblemOptions:
     checked_discretisations: tuple[RefinementKind, ...] = ("links", "time_step")
     divided_links_model: DividedLinksModel | None = field(default=None, compare=False, repr=False)
     cable_vertices: CableVertices | None = field(default=None, compare=False, repr=False)
+    sampling_time_step: float = 0.0
 
     @property
     def has_no_data_issue_above_warning(self) -> bool:

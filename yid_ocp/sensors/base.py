@@ -332,6 +332,7 @@ class SensorDataInputs:
     sensor_usage: Callable[[str], SensorOptions]  # sensor's options by settings key
     node_times: Array  # times of the rollout's nodes, shape (N + 1,) [s]
     time_step: float  # distance of the nodes [s]
+    sampling_stride: int  # number of steps between nodes at which filtered signals can be sampled
     effort_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' efforts
     path_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]

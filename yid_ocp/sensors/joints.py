@@ -163,10 +163,11 @@ def decorrelated_nodes_and_low_pass_values(
     `like_path` selects the path filter; the default is the effort filter, which is also applied to predictions. Raises
     `DataError`, which names the sensor's settings `key`, if there are too few samples for the filter.
     """
-    low_pass, times = inputs.path_filter if like_path else inputs.effort_filter, inputs.node_times
+    low_pass, every = inputs.path_filter if like_path else inputs.effort_filter, inputs.sampling_stride
+    times, step = inputs.node_times[::every], every * inputs.time_step
     # Neighbouring smoothed values are correlated: only nearly independent ones at samples are kept. Both ends are
     # omitted: there the filter has data on one side only, and impulses depend on motion outside the recording.
-    step, steps, distorted = inputs.time_step, len(times) - 1, low_pass.end_distortion_duration
+    steps, distorted = len(times) - 1, low_pass.end_distortion_duration
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     apart = max(1, round(period / step))
     ends = apart * math.ceil(max(1, math.ceil(distorted / step)) / apart)
@@ -178,7 +179,7 @@ def decorrelated_nodes_and_low_pass_values(
         hint = f"use a longer recording, raise problem.path_cutoff, or set sensors.{key}.use: false"
         raise DataError(what, where=f"recording '{inputs.recording.name}'", allowed=allowed, hint=hint)
     smooth, late = low_pass(t, values), 0.5 * period if at_centres else 0.0
-    return kept, np.stack([np.interp(times[kept], t + late, column) for column in smooth.T], axis=1)
+    return every * kept, np.stack([np.interp(times[kept], t + late, column) for column in smooth.T], axis=1)
 
 
 def is_noise_std_stated(joints: RecordedJointsInterface, group: str, choice: SensorOptions) -> bool:
@@ -264,7 +265,8 @@ def _may_stick(inputs: SensorDataInputs, names: tuple[str, ...], times: Array) -
         return np.zeros((len(times), len(names)), bool)
     position = joints.position[:, recorded_joint_column_indices(joints, names, inputs.recording.name)]
     speed = np.gradient(inputs.path_filter(joints.t, position), joints.t, axis=0)
-    reach = inputs.effort_filter.decorrelation_stride_for_step(inputs.time_step) * inputs.time_step
+    step = inputs.sampling_stride * inputs.time_step
+    reach = inputs.effort_filter.decorrelation_stride_for_step(step) * step
     first, last = np.searchsorted(joints.t, times - reach), np.searchsorted(joints.t, times + reach)
     windows = [speed[i : max(j, i + 1)] for i, j in zip(first, last, strict=True)]
     # the filter hides a short standstill at a reversal, so that only the sign of the speed shows it

@@ -297,7 +297,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if closed:
         return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
-        return "prescribed", f"the arm moves as measured, as it carries the object, and {seen} were recorded"
+        return "prescribed", f"the arm moves as measured, as it carries the object; also recorded: {seen}"
     return "prescribed", "the arm moves as measured; the object is estimated from its efforts, the only other data"
 
 
