@@ -384,6 +384,12 @@ def test_more_items_than_are_at_work_at_once_and_two_functions():
     assert sorted(x for group in squares.asked + others.asked for x in group) == list(range(20))
 
 
+def test_items_with_many_questions_do_not_all_wait_at_once():
+    squares = Answers()
+    map_with_merged_calls(lambda i: call_merged_with_other_threads(squares, 6 * [i]), range(9), 6)
+    assert squares.asked == [6 * [i] + 6 * [i + 1] + 6 * [i + 2] for i in (0, 3, 6)]
+
+
 def test_outside_and_within_an_item_one_asks_as_usual():
     squares = Answers()
     assert call_merged_with_other_threads(squares, [3]) == [9]

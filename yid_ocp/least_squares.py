@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg.lapack
@@ -44,21 +44,11 @@ class _SumOfSquares:
 _Model = TypeVar("_Model", LocalQuadraticModel, _SumOfSquares)
 
 
-@dataclass(frozen=True)
-class _Minimum(Generic[_Model]):
-    """The minimiser `x` (n,), the local model at `x`, iterations used, and whether the search converged."""
-
-    x: Array
-    final_model: _Model
-    n_iterations: int
-    has_converged: bool
-
-
 def levenberg_marquardt(
     residual_function: Callable[[Array], tuple[Array, Array]],
     initial_guess: Array,
     projection: Callable[[Array], Array] = lambda x: x,
-) -> _Minimum[_SumOfSquares]:
+) -> tuple[Array, _SumOfSquares]:
     """Minimise the sum of squares |r(x)|^2 by Gauss-Newton steps, with damping scaled by the Jacobian's column norms.
 
     The residual function returns r (m,) and its Jacobian (m, n). The projection maps a trial point to an admissible
@@ -80,16 +70,16 @@ def minimize_by_damped_newton(
     step_tolerance: float = 1e-9,
     cost_tolerance: float = 1e-10,
     min_damping: float = 1e-9,
-) -> _Minimum[_Model]:
-    """Minimise a cost by damped Newton steps on the local models that `model_at` returns.
+) -> tuple[Array, _Model]:
+    """Find the minimiser (n,) of a cost, and its local model, by damped Newton steps on the models of `model_at`.
 
-    The search converges if no component would move by more than `step_tolerance`, or if the cost decreases by less than
+    The search ends if no component would move by more than `step_tolerance`, or if the cost decreases by less than
     the fraction `cost_tolerance`. `min_damping` is the least damping; it keeps a search on a robust cost in its local
     minimum. The projection maps a trial point to an admissible point.
     """
     x = np.array(initial_guess, float)
     model, damping = model_at(x), _FIRST_DAMPING
-    for iteration in range(1, max_iterations + 1):
+    for _ in range(max_iterations):
         change = model.damped_step(damping)
         size = float(np.max(np.abs(change), initial=0.0))
         trial = projection(x + change * min(1.0, _MAX_STEP / max(size, 1e-12)))
@@ -98,10 +88,9 @@ def minimize_by_damped_newton(
             done = size < step_tolerance or model.cost - new.cost < cost_tolerance * model.cost
             x, model = trial, new
             damping = max(damping / 10, min_damping)
-            if done:
-                return _Minimum(x, model, iteration, True)
         else:
             damping *= 10
-            if size < step_tolerance or damping > _MOST_DAMPING:
-                return _Minimum(x, model, iteration, size < step_tolerance)
-    return _Minimum(x, model, max_iterations, False)
+            done = size < step_tolerance or damping > _MOST_DAMPING
+        if done:
+            break
+    return x, model

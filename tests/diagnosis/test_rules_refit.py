@@ -91,13 +91,13 @@ class Memory(dict):
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
-    made = SimpleNamespace(runs=[], failed=[], losses=[], known=None)
+    made = SimpleNamespace(runs=[], failed=[], losses=[], known=None, status=Status.CONVERGED)
 
     def run(problem, x, callback, evaluate=None):
         values = problem.named_values(x)
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)
-        status = Status.FAILED if failed else Status.STALLED
+        status = Status.FAILED if failed else made.status
         usual = {"message": "done", "equilibrium_guesses": "there", "evaluation": made.known}
         return SimpleNamespace(x=np.asarray(x), status=status, **usual)
 
@@ -204,6 +204,18 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
     assert found.values[A] == pytest.approx(0.75)
 
 
+@pytest.mark.parametrize(("status", "stairs"), [(Status.STALLED, 0.0), (Status.CONVERGED, 1.0)])
+def test_a_stalled_search_needs_slopes_that_do_not_follow_each_stair_of_the_cost(solved, monkeypatch, status, stairs):
+    slopes, known = np.array([[3.0, 1.0], [0.0, 2.0], [1.0, 0.0]]), []
+    problem = Problem(lambda values: 99.0, names=(A, S))
+    problem.bounds = np.array([0.76, -9.0]), np.array([9.0, 9.0])  # one end of the secants is cut off
+    problem.evaluate = lambda x, *_, **how: evaluation(9 + slopes @ x + 1e-3 * np.sign(np.sin(1e4 * x[0])), slopes + 1)
+    monkeypatch.setattr(module, "_refit_covariance_factor", lambda *a: known.append(a[1].jacobian) or 0.1 * np.eye(2))
+    solved.status = status
+    refit_with_effects(problem, [FRICTION], {A: 0.78, S: 0.5})
+    np.testing.assert_allclose(known[-1], slopes + stairs, atol=0.05)
+
+
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
     store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
@@ -284,7 +296,8 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
         left = 9.0 - ord(effects[-1].kind)
         return fit(effects, loss(left, left))
 
-    def batched(function, entries):
+    def batched(function, entries, rollouts):
+        assert rollouts == 2  # of each refit: one per recording
         batches.append([of.kind for (of,), _ in entries])
         return [function(entry) for entry in entries]
 

@@ -139,7 +139,7 @@ def apply_function_per_parameter_at_optimum(
         parts.count_done(name)
         return found
 
-    return dict(zip(names, map_with_merged_calls(one, names), strict=True))
+    return dict(zip(names, map_with_merged_calls(one, names, len(problem.episodes)), strict=True))
 
 
 def mark_near_zero_estimate_unidentifiable(

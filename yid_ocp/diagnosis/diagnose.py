@@ -169,7 +169,9 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
         return seen
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
     if fit.problem.step.time_step > _LONGEST_FINAL_TIME_STEP:
-        fall = _fall_at_half_time_step(seen.search, fit, seen.events, is_refitted)
+        seen.search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
+        fine = _at_finer_step(seen.search, fit, seen.events)
+        fall = discretisation.predicted_chi2_fall_at_finer_step(fine, *fit.at_estimates, is_refitted)
         if fall > least:
             return _at_half_time_step(seen, f"half the time step lowers chi2 by {fall:.3g}", fall)
     return seen if is_refitted else _without_error_of_links(seen, fit, least)
@@ -249,12 +251,6 @@ def _with_changed_parameters(
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
             return anew, judged
     return seen, judged
-
-
-def _fall_at_half_time_step(search: RefitContext, fit: RefittedModel, events: EventSet, is_refitted: bool) -> float:
-    search.progress.begin_stage("testing whether half the time step lowers chi2", 1.0, 12.0)
-    fine = _at_finer_step(search, fit, events)
-    return discretisation.predicted_chi2_fall_at_finer_step(fine, *fit.at_estimates, is_refitted)
 
 
 def _at_finer_step(search: RefitContext, fit: RefittedModel, events: EventSet) -> EstimationProblem:

@@ -26,6 +26,7 @@ from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
 
+_SECANT_STDS = 0.4  # half the length of secants, in stds of the unknowns: longer than the steps of a rough cost
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
@@ -245,9 +246,12 @@ def refit_with_effects(
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
+
+    def is_noise(end: Evaluation) -> bool:
+        return end.ok and null_test.chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level
+
     runs = [_attempt(problem, effects, start)]
-    _, _, end = runs[0]
-    if not (end.ok and null_test.chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
+    if not is_noise(runs[0][-1]):
         # earlier effects were already tried from both starts
         moved = filter(None, (effect.alternative_start(start) for effect in effects[-1:]))
         runs += [_attempt(problem, effects, {**start, **values}) for values in moved]
@@ -257,6 +261,8 @@ def refit_with_effects(
     values = own.unknowns.named_values(outcome.x)
     own = problem.relinearize_held_out_filters_of_problem(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
+    if outcome.status == Status.STALLED and not is_noise(finish):
+        factor = _refit_covariance_factor(own, _with_secants(own, finish, outcome.x, factor), limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
     sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
@@ -337,6 +343,19 @@ def _refit_covariance_factor(problem: EstimationProblem, finish: Evaluation, lim
     return factor * (std / np.linalg.norm(factor, axis=1))[:, None]
 
 
+def _with_secants(problem: EstimationProblem, at: Evaluation, x: Array, factor: Array) -> Evaluation:
+    """An evaluation with secants over a part of a std in place of derivatives, if all their ends can be evaluated.
+
+    Where friction holds a joint, the cost has small steps. Derivatives then differ from point to point, secants do not.
+    """
+    ends = [np.clip(x + sign * _SECANT_STDS * factor.T, *problem.bounds) for sign in (1.0, -1.0)]
+    found = [[problem.evaluate(end, False, at.equilibrium_guesses) for end in points] for points in ends]
+    if not all(point.ok for points in found for point in points):
+        return at
+    upper, lower = (np.array([point.residual for point in points]) for points in found)
+    return replace(at, jacobian=np.linalg.lstsq(ends[0] - ends[1], upper - lower, rcond=None)[0].T)
+
+
 def _effect_p_values(effects: Sequence[EffectBase], names: Sequence[str], x: Array, factor: Array) -> dict[str, float]:
     """Wald test of each effect: all amplitudes together, at fixed shapes, because weak effects have any shape.
 
@@ -395,5 +414,5 @@ def refit_with_each_effect(
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
-        fits += map_with_merged_calls(one, tried[i : i + size])
+        fits += map_with_merged_calls(one, tried[i : i + size], len(search.problem.problem.episodes))
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]

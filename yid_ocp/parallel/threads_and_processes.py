@@ -171,16 +171,20 @@ def call_merged_with_other_threads(
     return found
 
 
-def map_with_merged_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+def map_with_merged_calls(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], questions_per_item: int = 1
+) -> list[_Result]:
     """Apply a function to items, at most as many at once as there are threads, and return the results in order.
 
     Calls of `call_merged_with_other_threads` by different items become one call. Which calls are merged depends only on
-    the items. An item must not hold a lock during such a call.
+    the items. An item must not hold a lock during such a call. Waiting items keep their memory, so no more are at work
+    than fill two batches, with `questions_per_item` in each call.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]
-    march = _March(min(_MAX_CONCURRENT_ITEMS, len(entries)), threading.Semaphore(_max_threads()))
+    live = min(_MAX_CONCURRENT_ITEMS, len(entries), 1 + 2 * _MAX_CONCURRENT_ITEMS // questions_per_item)
+    march = _March(live, threading.Semaphore(_max_threads()))
     queue, guard = iter(range(len(entries))), threading.Lock()
     results, errors = dict[int, _Result](), dict[int, BaseException]()
 

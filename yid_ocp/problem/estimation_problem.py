@@ -396,6 +396,8 @@ def held_out_prediction_arguments(problem: EstimationProblem, x: ArrayLike) -> l
             found.append((episode, theta, problem.unpack_episode_unknowns(x, shared)[1]))
             continue
         episode = predictor.episode_with_fitted_initial_state(held, theta)
+        # an object that the fit made softer may rest on the other side of its grippers
+        episode = episode_with_equilibrium_guess(predictor, episode, theta)
         std = problem.priors.initial_state_stds
         found.append((episode, theta, _estimated_initial_state_offset(predictor, episode, theta, std)))
     return found

@@ -220,9 +220,9 @@ class InitialStateFitter:
             return np.concatenate([x[: len(free)], own])
 
         begin = np.concatenate([q[free], theta[wanted]])
-        found = levenberg_marquardt(lambda x: self._rows(*spread(x), task), begin, projection=allowed)
-        q, theta = spread(found.x)
-        return q, theta[index], found.final_model.cost
+        x, final = levenberg_marquardt(lambda x: self._rows(*spread(x), task), begin, projection=allowed)
+        q, theta = spread(x)
+        return q, theta[index], final.cost
 
     def _rows(self, q: Array, theta: Array, task: _InitialStateTask) -> tuple[Array, Array]:
         """Residual of a fit and its derivative by the free coordinates and the fitted parameters."""

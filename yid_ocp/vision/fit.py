@@ -270,10 +270,10 @@ class ShapeFitter:
                 return self._quadratic(self._with_free(q, bends), task)
 
             begin = end.q[list(self.free_joints)]
-            found = minimize_by_damped_newton(
+            x, final = minimize_by_damped_newton(
                 about, begin, max_iterations=most, step_tolerance=_PASS_TOLERANCE, cost_tolerance=_PASS_TOLERANCE
             )
-            end = _BestFit(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
+            end = _BestFit(self._with_free(end.q, x), final.hessian, final.cost)
         return end
 
     def _judged(
