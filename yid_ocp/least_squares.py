@@ -54,11 +54,9 @@ def levenberg_marquardt(
     The residual function returns r (m,) and its Jacobian (m, n). The projection maps a trial point to an admissible
     point (Nocedal and Wright 2006, Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5).
     """
-
-    def model_at(x: Array) -> _SumOfSquares:
-        return _SumOfSquares(*residual_function(x))
-
-    return minimize_by_damped_newton(model_at, initial_guess, projection=projection, min_damping=1e-12)
+    return minimize_by_damped_newton(
+        lambda x: _SumOfSquares(*residual_function(x)), initial_guess, projection=projection, min_damping=1e-12
+    )
 
 
 def minimize_by_damped_newton(

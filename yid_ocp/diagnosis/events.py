@@ -135,11 +135,6 @@ class EventSet:
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
-    def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """Return two sets: the force events, and all others (wrong samples and overspeeds)."""
-        forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
-        return EventSet(forces), EventSet(others, self.overspeeds)
-
     def events_of_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
         """Return the events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
@@ -180,10 +175,10 @@ def find_events(
     least = limits.min_log_bayes_factor
     smoothed = smooth_unknown_forces_and_biases(own, x, evaluation, least) if is_flagged else None
     found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
-    pushed, others = found.split_force_from_other_events()
+    pushed = EventSet(tuple(e for e in found.disturbances if e.kind == "force"))
     left = 1 - _MIN_FORCE_EVENT_GAP_FRACTION
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > left * _excess(fit, own):
-        found = others
+        found = replace(found, disturbances=tuple(e for e in found.disturbances if e.kind != "force"))
     return found, smoothed
 
 

@@ -246,12 +246,9 @@ def refit_with_effects(
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
-
-    def is_noise(end: Evaluation) -> bool:
-        return end.ok and null_test.chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level
-
     runs = [_attempt(problem, effects, start)]
-    if not is_noise(runs[0][-1]):
+    _, _, end = runs[0]
+    if not (end.ok and null_test.chi2_p_value(2 * end.cost, len(end.residual)) >= limits.significance_level):
         # earlier effects were already tried from both starts
         moved = filter(None, (effect.alternative_start(start) for effect in effects[-1:]))
         runs += [_attempt(problem, effects, {**start, **values}) for values in moved]
@@ -261,7 +258,7 @@ def refit_with_effects(
     values = own.unknowns.named_values(outcome.x)
     own = problem.relinearize_held_out_filters_of_problem(own, effects, values)
     factor = _refit_covariance_factor(own, finish, limits)
-    if outcome.status == Status.STALLED and not is_noise(finish):
+    if outcome.status == Status.STALLED and finish.cost > len(finish.residual):  # chi2 per sample is above 2
         factor = _refit_covariance_factor(own, _with_secants(own, finish, outcome.x, factor), limits)
     ranges = ((name, *ends) for effect in effects for name, ends in effect.prior_ranges.items())
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
