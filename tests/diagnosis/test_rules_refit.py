@@ -304,14 +304,19 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
-    search, march = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b"], ["c"], ["d"]]
+    search, march = (
+        RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0, n_recordings=2),
+        [["a"], ["b"], ["c"], ["d"]],
+    )
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
     assert refit_with_each_effect(search, (), tried[:1], {}) == []
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    assert len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard()), (), tried, {})) == 6
+    assert (
+        len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_recordings=2), (), tried, {})) == 6
+    )
     assert batches == [[*"abcdef"]]
 
 

@@ -92,10 +92,10 @@ def diagnose(
         problem, earlier = problem_with_priors_and_baseline(problem, baseline)
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
-        search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, stage_ends={"": begun})
+        known, count = (known_fits.solution, known_fits.store, thresholds), len(composed.problem.episodes)
+        search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, count, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
-        known = known_fits.solution, known_fits.store, thresholds
         return _diagnosed(problem, _examined(search, fit_nominal_model(problem, composed, *known)), earlier)
 
 

@@ -145,6 +145,7 @@ class RefitContext:
     progress: Progress
     store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
+    n_recordings: int = 1  # to which each refit fits; they are simulated together
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
@@ -411,5 +412,5 @@ def refit_with_each_effect(
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
-        fits += map_with_merged_calls(one, tried[i : i + size], len(search.problem.problem.episodes))
+        fits += map_with_merged_calls(one, tried[i : i + size], search.n_recordings)
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]
