@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
@@ -146,14 +145,16 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 
 
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    (here := tmp_path / "here").mkdir()
+    monkeypatch.chdir(here)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
     embedded = load_config(None, (), SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
-    for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
-        with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
+    # another command has another embedded configuration, so the folder's is named
+    for settings, out, near in ((changed, "runs/a b", "'runs/a b"), (embedded, "../a", f"{tmp_path}/a")):
+        with atomic_run_folder(settings, out) as folder:
             folder.record_run_start(settings, "diagnose")
-            assert folder.write_result({})["command"] == command
-        shutil.rmtree(folder.path)
+            written = folder.write_result({})["command"].removesuffix("'")
+        assert written == f"yid-ocp diagnose {near}/config.yaml"
 
 
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])

@@ -50,9 +50,8 @@ class RunFolder:
         """Write and return config.yaml, hash the inputs, and log a command's start. Errors: `input_files_by_name`."""
         write_text(self.path / "config.yaml", text := config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
-        origins = list(run.key_locations.values())
-        said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
-        if any(origin.startswith("--set") for origin in origins):
+        origins, said = list(run.key_locations.values()), [run.config_file]
+        if any(origin.startswith(("embedded default", "--set")) for origin in origins):
             near = os.path.relpath(self.final_path)
             said = [str((self.final_path if near.startswith("..") else Path(near)) / "config.yaml")]
         self.log_command_start([command, *said, *flags])
@@ -279,6 +278,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
     try:
         target = Path(out).expanduser().absolute()
         is_link, is_folder = target.is_symlink(), target.is_dir()
+        target = target.resolve() if ".." in target.parts and not is_link else target
         filled, is_existing_file = is_folder and any(target.iterdir()), not is_folder and target.exists()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, or an unknown user's home
         raise folder_error(error, Path(str(out)[:200]), "this path cannot be a run folder") from error
