@@ -55,7 +55,6 @@ def main(arguments: list[str] | None = None) -> int:
         "wall [s]",
         "CPU [s]",
         "/ gauss_newton",
-        "peak [MiB]",
     )
     for title in titles:
         table.add_column(title, justify="left" if title in ("method", "status") else "right")
@@ -74,7 +73,6 @@ def main(arguments: list[str] | None = None) -> int:
             f"{run.wall_seconds:.2f}",
             f"{run.cpu_seconds:.2f}",
             f"{ratios[name]:.1f}",
-            f"{run.peak_memory_mib:.0f}",
         )
     Console(width=None if sys.stdout.isatty() else 120).print(table)
     if options.json is not None:

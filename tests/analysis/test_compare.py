@@ -1,9 +1,7 @@
 """Several methods on one problem: cost in time, agreement, and what is said of parameters that nothing informs."""
 
 import math
-import mmap
 import re
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -45,7 +43,6 @@ def test_methods_agree_on_what_the_data_inform(problem):
     assert {run.method for run in found.method_results} == set(told) == {"gauss_newton", "single_shooting"}
     for run in found.method_results:
         assert run.wall_seconds > 0
-        assert run.peak_memory_mib > 10
         assert len(run.held_out_predictions) == 1
 
 
@@ -144,7 +141,7 @@ class Problem:
         return Problem(options.weighting)
 
     def evaluate(self, x, derivatives=True):
-        return SimpleNamespace(cost=float(x[-1]))
+        return SimpleNamespace(cost=float(x[-1]), ok=False)
 
     def predict_held_out(self, x):
         return [(self.options.weighting, float(x[-1]))]
@@ -230,6 +227,8 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(compared, w
     assert [run.held_out_predictions for run in found.method_results] == predicted
     assert found.verdict_solution == replace(found.method_results[1].solution, message="checked")
     assert [run.solution.message for run in found.method_results] == ["done", "profiled", "done"]
+    # chi2 of the residual of the problem, not of the method's own weights
+    assert math.isnan(found.method_results[2].solution.goodness_of_fit.chi2_per_dof) == (weighting == "whitened")
 
 
 METHODS = {"single_shooting": 3.0, "gauss_newton": 2.0, "steepest_descent": 5.0}
@@ -277,20 +276,6 @@ def test_a_callback_stops_any_search_at_its_last_iterate(repository, solver):
     assert (found.status, found.message) == (Status.ITERATION_LIMIT, "enough")
     assert [entry.iteration for entry in found.history] == [0, 1, 2]
     assert np.array_equal(found.x, found.history[-1].x)
-
-
-def test_the_peak_of_memory_is_what_was_used_in_between(compared, monkeypatch):
-    def fit(*arguments, **settings):
-        large = np.frombuffer(mmap.mmap(-1, 200_000_000), np.uint8)  # not from memory that the process has kept
-        large.fill(1)
-        time.sleep(0.1)
-        return found_by(a=estimate(1.0))
-
-    plain = compared(one=found_by(a=estimate(1.0))).method_results[0].peak_memory_mib
-    monkeypatch.setattr(module, "fit_problem", fit)
-    found = compare_methods(Problem(), [SimpleNamespace(name="one")])
-    assert 150 < found.method_results[0].peak_memory_mib - plain < 300
-    assert found.method_results[0].wall_seconds > 0.1
 
 
 def test_the_published_values_are_those_of_the_paper():
@@ -416,24 +401,6 @@ def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     assert "of inf times the noise" in choose_fit_with_or_without_shape_memory(problem, None, found).message
     solved.ok = False
     assert choose_fit_with_or_without_shape_memory(problem, None, found).solution is found
-
-
-ENTRY = {
-    "recording": "run",
-    "rmse": {"points.a": 0.02, "points.b": 0.01, "points": 0.016},
-    "baselines": {"stays": {"points.a": 0.01, "points.b": 0.0099}, "zero": {"points.a": 0.015}},
-}
-
-
-def test_a_channel_is_worse_than_a_guess_where_the_best_one_is_clearly_nearer():
-    units = {"points.a": "m", "points.b": "m"}
-    [found] = estimation.channels_worse_than_naive_prediction([ENTRY], units)
-    assert found == {
-        **{"recording": "run", "channel": "points.a", "unit": "m"},
-        **{"baseline": "stays", "guess": pytest.approx(0.01), "rmse": pytest.approx(0.02)},
-    }
-    better = ENTRY | {"rmse": {"points.a": 0.0101, "points.b": 0.01}}
-    assert estimation.channels_worse_than_naive_prediction([better], units) == []
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.profile import solution_with_profile_intervals
@@ -22,7 +19,6 @@ from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, fit_problem
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
-_MEMORY_SAMPLING_PERIOD = 0.02
 # Two estimates agree if they differ by less than this many of the larger std, or this fraction (stopping rules).
 _AGREEMENT_STDS, _AGREEMENT_RTOL = 2.0, 0.005
 _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
@@ -30,7 +26,7 @@ _SOLVE_LABEL = "solve"  # the run that gives the verdicts, by all noise
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """Result of one method: solution, cost with the problem's whitened residual, times and largest resident memory."""
+    """Result of one method: solution, cost and fit with the problem's whitened residual, and times."""
 
     method: str
     solution: Solution
@@ -38,7 +34,6 @@ class _MethodResult:
     held_out_predictions: list[EpisodeAndPredictionOrFailure]
     wall_seconds: float
     cpu_seconds: float
-    peak_memory_mib: float
 
     @property
     def has_values(self) -> bool:
@@ -97,14 +92,16 @@ def compare_methods(
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
         wall, cpu = time.perf_counter(), time.process_time()
-        with _Memory() as memory:
-            told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
-            solution = fit_problem(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
+        told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
+        solution = fit_problem(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         if whole.has_process_noise:
             solution = replace(solution, parameters=uncertainty.mark_free_estimates_not_trusted(solution.parameters))
-        taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak
-        cost = problem.evaluate(solution.x, derivatives=False).cost
-        runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
+        taken = time.perf_counter() - wall, time.process_time() - cpu
+        evaluation = problem.evaluate(solution.x)
+        if own is not problem:  # chi2 of all methods must count the same residual
+            fit = uncertainty.assess_goodness_of_fit(problem, evaluation, limits)
+            solution = replace(solution, goodness_of_fit=fit)
+        runs.append(_MethodResult(solver.name, solution, evaluation.cost, own.predict_held_out(solution.x), *taken))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
         runs[runs.index(best)] = best = replace(best, solution=solution_with_profile_intervals(problem, best.solution))
@@ -134,34 +131,6 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
     else:
         why = "its cost weights the measurements differently"
     return [f"gives other values than {best.method}, because {why}: {', '.join(values)}"] if values else []
-
-
-class _Memory:
-    """A context manager whose thread samples the resident memory of this process; `peak` is the largest value [MiB]."""
-
-    def __enter__(self) -> _Memory:
-        self.peak, self._stop = _resident(), threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        while not self._stop.wait(_MEMORY_SAMPLING_PERIOD):
-            self.peak = max(self.peak, _resident())
-
-
-def _resident() -> float:
-    status = Path("/proc/self/status")
-    lines = status.read_text(encoding="ascii", errors="replace").splitlines() if status.is_file() else []
-    for line in (line for line in lines if line.startswith("VmRSS:")):
-        return float(line.split()[1]) / 1024.0
-    import resource  # not available on Windows
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
 
 
 _PAPER_PARAMETERS = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
