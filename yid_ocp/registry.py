@@ -36,7 +36,9 @@ class Registry(Generic[_Entry]):
             self._entries.pop(name, None)
 
     def __getitem__(self, name: str) -> _Entry:
-        require_known_names([name], self, self.entry_noun, f"the name of the {self.entry_noun}", ConfigError)
+        if name not in self._entries:  # entries whose description has this word are listed first
+            known = sorted(self, key=lambda own: name.lower() not in f"{own} {self._entries[own].__doc__}".lower())
+            require_known_names([name], known, self.entry_noun, f"the name of the {self.entry_noun}", ConfigError)
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

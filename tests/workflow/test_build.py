@@ -136,7 +136,7 @@ def test_effects_bring_their_parameters(written):
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
         ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
         ("model:\n  object: {kind: segments, named_segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
-        ("model:\n  object: {kind: foam_y}\n  measured_points: [w_T9]\n", "line 1: model"),
+        ("model:\n  object: {kind: foam_y}\n  measured_points: [w_T9]\n", "line 3: model.measured_points"),
     ],
 )
 def test_errors_of_the_model_name_the_setting(written, text, message):

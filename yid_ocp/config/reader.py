@@ -309,7 +309,8 @@ class _Reader:
                 advice += f", converted from {match[2].strip()}"
         if isinstance(raw, dict) and options.variadic_tuple_entry_type(hint) is not None:
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
-        what = f"{self._name(path)} is {_shown(raw)}, which is not allowed"
+        shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) else _shown(raw)
+        what = f"{self._name(path)} is {shown}, which is not allowed"
         return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
 
     @staticmethod

@@ -452,8 +452,12 @@ class RunSettings:
     def setting_location(self, *path: str | int) -> str:
         """Return the place of a setting (file, line and key) as text, for the `where` of an error message."""
         key, place = ".".join(map(str, path)), innermost_location(self.key_locations, path) or self.config_file
-        is_told = place in (f"--set {key}", f"--set {key.rstrip('.0123456789')}")  # of a list, an error names the entry
-        return place if is_told else ": ".join(filter(None, (place, key)))
+        option, _, told = place.partition(" ")
+        # an override of another key is told only because it made the section of both
+        if option == "--set" and not (f"{key}.".startswith(f"{told}.") or told.startswith(f"{key}.")):
+            option, place = "", self.config_file
+        rest = f"{key}.".removeprefix(f"{told}.").strip(".0123456789") if option == "--set" else key  # of a list: none
+        return place if option == "--baseline" else ": ".join(filter(None, (place, rest)))
 
     def config_error(self, what: str, *path: str | int, hint: str, allowed: str = "") -> ConfigError:
         """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""

@@ -112,7 +112,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         hint += f", or {other.name}={begin - start - best.lag:.4f}, the likeliest by the motion" if best else ""
         raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
     why = "because the recording times do not overlap. With this shift, the points follow the joint angles best "
-    why += f"({best.explained:.1%} of the motion). A fit of the model corrects its error (± {_ALIGNED_CLOCK_STD:g} s)"
+    why += f"({best.explained:.1%} of the motion). A fit of the model corrects the rest (± {_ALIGNED_CLOCK_STD:g} s)"
     return begin - start - best.lag, why
 
 

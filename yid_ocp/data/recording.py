@@ -415,7 +415,8 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
             row, column = (int(index[0]) for index in np.nonzero(bad))
             what = f"channel '{channel}' has {count_with_noun(int(bad.sum()), 'missing or infinite value')}, "
             what += f"the first of joint '{joints.names[column]}' at t = {joints.t[row]:g} s"
-            hint = "cut the recording before or after them, or remove the channel's columns from the file"
+            hint = "delete the samples at these times from the file, of all joints (short gaps are interpolated)"
+            hint += ", or leave out this channel" * (channel != "position")
             hint += ", or use read_recording(..., allow_nan_effort=True)" if is_effort else ""
             raise DataError(what, where=place, allowed="finite numbers", hint=hint)
         unit, size = JOINT_CHANNEL_UNITS[channel], np.nan_to_num(np.abs(value))

@@ -159,19 +159,19 @@ class Mechanism(ReprMixin):
         """Check whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
-    def frame(self, name: str) -> Frame:
+    def frame(self, name: str, where: str = "") -> Frame:
         """Return a frame by name. `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length.
 
         Such a point is fixed to the straight link that contains it. Raises `ModelError` if there is no such frame (with
-        the nearest name), or if the percentage is not from 0 to 100.
+        the nearest name), or if the percentage is not from 0 to 100. `where` is the place of the name, for the error.
         """
         if name in self.frames:
             return self.frames[name]
         line, _, said = name.partition(":")
         if not self.has_frame(name):
-            known = (*self.frames, *(f"{entry}:{said}" for entry in self.link_chains if said))
+            known = (*(f"{entry}:{said or '50%'}" for entry in self.link_chains), *self.frames)
             choice = unknown_name_error_arguments(name, known, "use one of these frames, or add one to model.frames")
-            raise ModelError(f"there is no frame '{name}'", where=f"model '{self.name}'", **choice)
+            raise ModelError(f"there is no frame '{name}'", where=where or f"model '{self.name}'", **choice)
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))

@@ -32,12 +32,12 @@ class Parameter:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
             what, allowed = f"{self.name} = {self.value} is not a finite number", f"a finite number [{self.unit}]"
-            raise ConfigError(what, where=f"parameter {self.name}", allowed=allowed, hint="pass a finite `value`")
+            raise ConfigError(what, where=f"parameters.{self.name}", allowed=allowed, hint="pass a finite `value`")
         if not self.lower <= self.value <= self.upper:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
-            where, hint = f"parameter {self.name}", f"change parameters.{self.name}.initial, or its `bounds`"
+            where, hint = f"parameters.{self.name}", f"change parameters.{self.name}.initial, or its `bounds`"
             raise ConfigError(what, where=where, allowed=f"{self.lower:g} to {self.upper:g} {self.unit}", hint=hint)
 
 
@@ -90,7 +90,7 @@ class Parameters(ReprMixin):
         for name, value in (values or {}).items():
             if not math.isfinite(value):
                 what, hint = f"{name} = {value} is not a finite number", f"pass for example {self[name].value:g}"
-                raise ConfigError(what, where=f"parameter {name}", allowed="a finite number", hint=hint)
+                raise ConfigError(what, where=f"parameters.{name}", allowed="a finite number", hint=hint)
             theta[self.index(name)] = value
         return theta
 

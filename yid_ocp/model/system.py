@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 import casadi as ca
@@ -463,8 +463,10 @@ def _check_names(
     if both := sorted(set(driven) & set(prescribed)):
         what, hint = f"joint '{both[0]}' is both driven and prescribed", f"leave '{both[0]}' out of one of the lists"
         raise ModelError(what, where="driven and prescribed joints", allowed="one of the two", hint=hint)
-    for frame in [*(name for grasp in grasps for name in (grasp.holder_frame, grasp.held_frame)), *points]:
-        tree.frame(frame)
+    for grasp, key in product(grasps, ("holder_frame", "held_frame")):
+        tree.frame(getattr(grasp, key), f"model.grasp.{grasp.name}.{key}")
+    for point in points:
+        tree.frame(point, "model.measured_points")
     for one, two in combinations([grasp for grasp in grasps if grasp.compliance.is_zero()], 2):
         if {one.holder_frame, one.held_frame} == {two.holder_frame, two.held_frame}:
             frames = f"the same two frames, {two.holder_frame} and {two.held_frame}"

@@ -111,7 +111,8 @@ class FramePositionEvaluator:
     def __init__(self, system: System, names: Sequence[str], where: str = "plan.point") -> None:
         for name in names:
             if not system.mechanism.has_frame(name):
-                said = unknown_name_error_arguments(name, system.point_frames)
+                known = (*system.point_frames, *(f"{own}:50%" for own in system.mechanism.link_chains))
+                said = unknown_name_error_arguments(name, (*known, *(own.holder_frame for own in system.grasps)))
                 raise ConfigError(f"there is no frame '{name}'", where=where, **said)
         self.names = tuple(names)
         with CASADI_LOCK:
@@ -403,7 +404,8 @@ def solve_equilibrium_at_point_target(
     rest = statics.solve(found.x, theta, guess=guess[0])
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - target)) if rest.is_converged else np.inf
     if not distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
-        off = f"{1e3 * distance:.3g} mm off" if rest.is_converged else "at no position near the target"
+        size = f"{distance:.3g} m" if distance >= 1 else f"{1e3 * distance:.3g} mm"
+        off = f"{size} off" if rest.is_converged else "at no position near the target"
         near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
         names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
         limits = f", with {names} at the joint's limit" if names else ""

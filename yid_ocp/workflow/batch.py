@@ -81,8 +81,8 @@ def batch_runs_from_configs(
     if recordings is not None:
         files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
         if not files:
-            advice = "put the pattern in quotes, so that the shell does not expand it, and check the folder"
-            allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
+            advice = "check the folder, and put the pattern in quotes, so that the shell does not expand it"
+            allowed = f"a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to {Path.cwd()}"
             what, where = "no recording matches the pattern", f"--recordings {recordings}"
             raise ConfigError(what, where=where, allowed=allowed, hint=advice)
         entries = []

@@ -148,7 +148,7 @@ def build_problem(
         raise run.config_error("no parameter is free, so there is nothing to estimate", "parameters", **choice)
     if same := sorted(set(run.recordings.estimate) & set(run.recordings.held_out)):
         what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"
-        raise run.config_error(what, "recordings", "held_out", allowed="every recording in one list", hint=hint)
+        raise run.config_error(what, "recordings", "held_out", allowed="each recording in only one of them", hint=hint)
     estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
         what, allowed = "no recording is listed for estimation", "one recording or more"

@@ -204,7 +204,8 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
     recorded = recordings[0].joint_names
     if not (known := [name for name in whole.joint_names if name in recorded]):
         what = f"none of the recorded joints is a joint of the robot: {', '.join(recorded)}"
-        hint = f"rename them at the import: --joints {recorded[0]}={whole.joint_names[0]},..."
+        hint = "give the URDF or MJCF file of the robot that was recorded. If it is the same robot with other names, "
+        hint += f"rename its joints at the import: --joints {recorded[0]}={whole.joint_names[0]},..."
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     return known
 

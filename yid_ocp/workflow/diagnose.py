@@ -25,6 +25,7 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import torque_law_tables_csv
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.inference import uncertainty
@@ -55,7 +56,9 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     settings = load_config(arguments.config, arguments.overrides, SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
-        settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said))
+        key = ("diagnosis", "baseline_run_folders")
+        at = {own: place for own, place in settings.key_locations.items() if own[:2] != key} | {key: "--baseline"}
+        settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline_run_folders=said), key_locations=at)
     return run_command_and_print(arguments, lambda shown: run_diagnose(settings, arguments.out, shown))
 
 
@@ -68,6 +71,10 @@ def run_diagnose(
         refits = _SingleJsonFileRefitStore(folder, folder.input_hashes, text, software_and_plugin_versions())
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=24.5)
+        run_inputs.load_plugins(run)  # they may register effects
+        with run_inputs.add_setting_location_to_errors(run, "diagnosis", "candidates"):
+            for text in () if isinstance(run.diagnosis.candidates, str) else run.diagnosis.candidates:
+                _ = EFFECTS[text.partition("@")[0]]  # a misspelt name needs no model
         runs = run_history.estimates_of_each_baseline_run(run)
         without, said = run_history.recordings_without_effect_or_reason(run)
         if said:
@@ -191,8 +198,9 @@ class _LoggedProgress(Progress):
 
 def _flags(run: RunSettings) -> list[str]:
     said = run.key_locations
-    if any(at.startswith("--set") or key[:2] == ("diagnosis", "baseline_run_folders") for key, at in said.items()):
-        return []
+    given = said.get(("diagnosis", "baseline_run_folders"), "--baseline")
+    if given != "--baseline" or any(at.startswith("--set") for at in said.values()):
+        return []  # the configuration has them
     return [part for folder in run.diagnosis.baseline_run_folders for part in ("--baseline", folder)]
 
 

@@ -228,7 +228,8 @@ def _refuse_losses(
     lost += [f"grasp {name}" for name, entry in grasps.items() if entry.loses_motion_or_force]
     if lost and not is_lossy:
         what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
-        hint = "add --lossy to write the file without them; the manifest beside it (.json) has the reason for each"
+        other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
+        hint = f"{other}add --lossy to leave them out; the manifest beside the file (.json) has the reason for each"
         raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)
 
 

@@ -22,11 +22,12 @@ from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
+from yid_ocp.errors import ConfigError, require_known_names
 from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status
-from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
+from yid_ocp.workflow.build import build_step, build_system, free_parameter_names, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function, worker_config_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -92,7 +93,10 @@ def run_identifiability(
     with atomic_run_folder(run, out, "identifiability") as folder:
         folder.record_run_start(run, "identifiability", asked._command_line_flags())
         progress.begin_stage("building the model and its compiled step")
-        system = build_system(run)
+        system, wanted = build_system(run), asked.interval_parameters
+        if not isinstance(wanted, str):
+            free = free_parameter_names(run, system.parameters)
+            require_known_names(wanted, free, "free parameter", "--intervals", ConfigError)
         problem = whole = build_problem(run, build_step(run, system_with_grasp_offset_effects(system)))
         limits = run.diagnosis.fit_excess_residual_criteria
         solution = None

@@ -249,12 +249,15 @@ def require_recordings_not_in_baseline(
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
-            where = ("diagnosis", "baseline_run_folders")
+            where, hint = (
+                ("diagnosis", "baseline_run_folders"),
+                "leave it out of `recordings`, or choose another baseline",
+            )
             what = f"the recording {episode.name} would count twice, because the baseline has it too"
             if not runs or run.recordings.without_effect:
-                where = ("recordings", "without_effect")
+                where, hint = ("recordings", "without_effect"), "remove it from one of the two lists"
                 what = f"the recording {episode.name} is also a reference recording"
-            raise run.config_error(what, *where, allowed="other recordings", hint="remove it from one of the two lists")
+            raise run.config_error(what, *where, allowed="other recordings", hint=hint)
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
