@@ -80,7 +80,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert abs(entry["value"] - value) < 4 * entry["std"] < 0.2 * value
         assert entry["verdict"] == "identifiable"
     assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
-    assert (result["fit"]["explains"], result["fit"]["worse_than_guess"]) == (True, [])
+    assert result["fit"]["explains"]
     assert 0.01 < result["fit"]["p_value"] <= 1
     assert "The model explains the recordings to within their noise" in done.out
     channel = result["residuals"]["joints.effort.shoulder"]
@@ -215,8 +215,7 @@ def test_check(carried_out, pendulum):
     assert result["format"] == "yid-check/1"
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
-    assert {"time_step", "links", "encoder_noise", "std"} == set(result["discretisation"]["shoulder.stiffness"])
-    shown = f"the model error is {result['initial_misfit']:.0f}", "100 Hz", "run folder: run"
+    shown = "`solve` tests how links and time step change", "100 Hz", "run folder: run"
     assert [text for text in shown if text not in done.out] == []
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}

@@ -96,21 +96,20 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
 
 
 def _gauss_newton_step_in_finer_model(
-    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation, *, model_difference_only: bool = False
+    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> tuple[dict[str, float], Array, Evaluation] | str:
     """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
     Returns the shift of each shared free parameter, the linearised residual after the step and the fine evaluation, or
-    a message if the step fails. `at_x` is the coarse evaluation at `x`. With `model_difference_only`, for points that
-    are no estimate, coarse predictions replace the data. With process noise, or the same links and samples, Jacobian
-    and priors are coarse.
+    a message if the step fails. `at_x` is the coarse evaluation at `x`. With process noise, or the same links and
+    samples, Jacobian and priors are coarse.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
     problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
     own, other = problem.residual_rows, coarse.residual_rows
-    if (model_difference_only or weighted) and own.measurements != other.measurements:
+    if weighted and own.measurements != other.measurements:
         return "the finer model would use other samples of the recordings"
     is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
@@ -120,8 +119,6 @@ def _gauss_newton_step_in_finer_model(
     if is_alike:
         problem, point, jacobian = coarse, x, at_x.jacobian
         residual = np.concatenate([residual[other.data], at_x.residual[other.data.stop :]])
-    if model_difference_only:
-        residual = np.pad(residual[own.data] - at_x.residual[other.data], (0, len(residual) - own.data.stop))
     assert jacobian is not None
     scale = problem.unknown_scales
     low, high = ((bound - point) / scale for bound in problem.bounds)
@@ -329,14 +326,12 @@ def parameter_shifts_at_finer_discretisation(
     at_x: Evaluation,
     kinds: Sequence[RefinementKind],
     progress: Progress = NULL_PROGRESS,
-    *,
-    model_difference_only: bool = False,
 ) -> tuple[dict[str, EstimateShiftByDiscretisation], list[str]]:
     """Compute how much estimates change with twice the links, half the time step, and more noise of encoders.
 
     `kinds` selects `links` and `time_step`; with any, noise is added. `x` (nx,) is the estimate, `at_x` its evaluation
-    with Jacobian. `model_difference_only` is for an `x` that is no minimum of the cost; no noise is added then. Returns
-    the shifts by shared free parameter, and notes on refinements that failed or would remove a quarter of the misfit.
+    with Jacobian. Returns the shifts by shared free parameter, and notes on refinements that failed or would remove a
+    quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
     notes, settings = list[str](), finer_setting_texts(problem)
@@ -346,8 +341,7 @@ def parameter_shifts_at_finer_discretisation(
             continue
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:
-            problems = _refined_problem(problem, key), problem
-            own = _gauss_newton_step_in_finer_model(*problems, x, at_x, model_difference_only=model_difference_only)
+            own = _gauss_newton_step_in_finer_model(_refined_problem(problem, key), problem, x, at_x)
         except YidError as error:
             own = error.what
         if isinstance(own, str):
@@ -358,10 +352,10 @@ def parameter_shifts_at_finer_discretisation(
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
-            if not model_difference_only and excess - rest > least:
+            if excess - rest > least:
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
                 notes.append(f"{said}. First set {settings[key]}, and run `solve` again.")
-    if kinds and not model_difference_only and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
+    if kinds and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()
     return {n: EstimateShiftByDiscretisation(**{key: own[n] for key, own in found.items()}) for n in names}, notes

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation, step_diagnostics
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
+from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
-from yid_ocp.display import Progress, count_with_noun
+from yid_ocp.display import Progress, abbreviated_names_text, count_with_noun
 from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
+from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -23,17 +26,16 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.animation import AnimationData, animation_of_trajectories, measured_motion_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
-from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, link_division_parameter_scale, urdf_reader_arguments
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data, min_grasp_gaps_at_start
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandOutcome, make_command_function
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
-from yid_ocp.workflow.solve import discretisation_shifts_to_dict
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
+_STIFFNESS_UNITS = ("N m^2", "N m/rad", "N/m")
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
@@ -58,14 +60,10 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         mechanics = _mechanics(run, step, problem, warnings)
         progress.begin_stage("testing whether links and time step are fine enough")
         convergence = _frequency_convergence(run, problem, warnings)
-        coarse = convergence["warnings"]
-        moved, shown, misfit = {}, {}, None
+        shown = {}
         if problem is not None:
-            first = problem.evaluate(problem.initial_unknowns)
-            moved = _moves(problem, first, warnings, coarse, progress)
-            noise = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
-            residual = first.residual[problem.residual_rows.data] / noise
-            misfit = float(np.sqrt(np.mean(residual**2))) if first.ok else None
+            first = problem.evaluate(problem.initial_unknowns, derivatives=False)
+            _warn_of_simulation_at_start(problem, first, warnings)
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
@@ -75,14 +73,12 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "mechanics": mechanics,
             "recordings": recordings,
             "convergence": convergence,
-            "discretisation": moved,
-            "finer_settings": {} if problem is None else discretisation.finer_setting_texts(problem),
             "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
-            "initial_misfit": misfit,
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandOutcome(folder.path, written, None, not (run.recordings.stop_on_any_issue and warnings + coarse))
+    is_refused = run.recordings.stop_on_any_issue and bool(warnings or convergence["warnings"])
+    return CommandOutcome(folder.path, written, None, not is_refused)
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -182,26 +178,14 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
     return scenes
 
 
-def _moves(
-    problem: EstimationProblem, at_x: Evaluation, warnings: list[str], coarse: list[str], progress: Progress
-) -> dict[str, Any]:
-    x = problem.initial_unknowns
-    growth = discretisation.alternating_error_growth_of_worst_recording(problem, x)
+def _warn_of_simulation_at_start(problem: EstimationProblem, at_x: Evaluation, warnings: list[str]) -> None:
+    growth = discretisation.alternating_error_growth_of_worst_recording(problem, problem.initial_unknowns)
     if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.stability_message}")
     if not at_x.ok:
         said = "the model cannot be simulated with the initial parameters, so `solve` may fail. Set larger stiffnesses "
         said += f"(parameters.NAME.initial) or problem.time_step: {problem.step.time_step / 2:g}"
         warnings.append(f"{said}. The reason: {at_x.message}")
-        return {}
-    shifts, notes = discretisation.parameter_shifts_at_finer_discretisation(
-        problem, x, at_x, ("links", "time_step"), progress, model_difference_only=True
-    )
-    # the misfit of initial values does not predict the uncertainty after a fit
-    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
-    std = parameter_estimates(problem, x, at_x, covariance, None)
-    coarse += notes
-    return discretisation_shifts_to_dict(shifts, {name: std[name].std for name in shifts})
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -230,6 +214,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         warnings.append(f"{grow}{remedy}or a larger model.damping")
     found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
+    warnings += _too_stiff_start_warnings(system, theta, h, *(row["hertz"][:1] for row in (steps[0], steps[-1])))
     _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
@@ -241,6 +226,19 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         links = f"the number of links goes from {count} to {2 * count}"
         _warn(found["warnings"], links, item.divided_links_setting_text, rows)
     return found
+
+
+def _too_stiff_start_warnings(
+    system: System, theta: Array, h: float, stated: Sequence[float], finest: Sequence[float]
+) -> list[str]:
+    """Return a warning if the lowest frequency, with the time step `h` and a quarter of it, only follows the step."""
+    if not finest or finest[0] < 1 / h:  # half of the highest frequency that a quarter of the step can hold
+        return []
+    known = [(system.parameters[name], x) for name, x in zip(system.parameters.names, theta, strict=True)]
+    stiff = [f"{own.name} ({x:.3g} {own.unit})" for own, x in known if own.unit in _STIFFNESS_UNITS]
+    said = f"the lowest natural frequency only follows the time step ({stated[0]:.3g} Hz with {h:g} s, {finest[0]:.3g} "
+    said += f"Hz with {h / 4:g} s), so with the initial parameters the model is too stiff to be identified. Check size "
+    return [f"{said}and unit of the initial values: {abbreviated_names_text(stiff)}"]
 
 
 def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:

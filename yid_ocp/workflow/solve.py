@@ -13,7 +13,7 @@ import numpy as np
 from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, EstimateShiftByDiscretisation, covariance_to_dict
+from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.solvers import Iterate, Solution, Status
@@ -51,7 +51,10 @@ def run_solve(
             "issues": issues_to_plain_data(checks.data_issues),
             "safeguard": checks.cable_memory_message,
             "covariance": _covariance_result(solution, checks.data_std),
-            "discretisation": discretisation_shifts_to_dict(checks.discretisation_shifts, checks.data_std),
+            "discretisation": {
+                name: {**asdict(own), "std": checks.data_std.get(name)}
+                for name, own in checks.discretisation_shifts.items()
+            },
             "finer_settings": discretisation.finer_setting_texts(problem),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
@@ -121,9 +124,8 @@ def solution_to_result_dict(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> dict[str, Any]:
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
-    errors, units, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
+    errors, _, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
-    worse = estimation.channels_worse_than_naive_prediction(errors, units)
     return {
         "format": "yid-solve/1",
         "status": solution.status.value,
@@ -133,14 +135,7 @@ def solution_to_result_dict(
         "iterations": solution.n_iterations,
         "evaluations": solution.n_evaluations,
         "seconds": solution.wall_time,
-        "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": worse},
+        "fit": asdict(solution.goodness_of_fit),
         "residuals": residuals,
         "held_out": [e | {"expected": dict(expected.get(e["recording"], {}))} for e in errors[: len(held_out)]],
     }
-
-
-def discretisation_shifts_to_dict(
-    shifts: Mapping[str, EstimateShiftByDiscretisation], std: Mapping[str, float]
-) -> dict[str, Any]:
-    """Return the shifts of estimates by finite links and time steps as dictionaries, with their `std` from noise."""
-    return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}
