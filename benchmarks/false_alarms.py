@@ -141,7 +141,6 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         "held_out_chi2_per_dof": finding.nominal_held_out_test.chi2_per_dof,
         "p_value": finding.nominal_test.p_value,
         "held_out_p_value": finding.nominal_held_out_test.p_value,
-        "channels": finding.nominal_held_out_test.channel_chi2,
         "best": [[score.effect.label, score.p_value] for score in finding.screening.candidate_scores[:3]],
         "candidates": len(finding.screening.candidate_scores),
         "named": [effect.label for effect in finding.accepted_effects],

@@ -64,10 +64,9 @@ def effect(label="friction@elbow", *quantities: ParameterDefinition, alone=False
     return (Local if alone else EffectBase)(kind, location, Parameters(entries), definitions=tuple(chosen))
 
 
-def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTestResult:
+def outcome(p=0.5, chi2=1.0, degrees=100.0, windows=()) -> NullTestResult:
     """The outcome of a null test."""
-    channels = {"points.tip": chi2} if channels is None else channels
-    return NullTestResult(chi2, degrees, p, dict(channels), tuple(windows))
+    return NullTestResult(chi2, degrees, p, tuple(windows))
 
 
 def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) -> _EffectSignature:

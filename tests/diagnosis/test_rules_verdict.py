@@ -62,7 +62,7 @@ def seen(tests, scores=()):
     },
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
-    tests = [f.outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
+    tests = [f.outcome(p=p, chi2=chi2) for p, chi2 in (before, held_out)]
     assert seen(tests).may_have_gap(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
 
 

@@ -92,7 +92,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
     assert result["where"][0]["location"] == "elbow"
     assert all(entry["closure"] is None for entry in result["which"])
     assert "joint_coulomb@elbow" in result["untried"]
-    assert "before any effect was tried" in result["summary"]
+    assert "before the model was refitted" in result["summary"]
 
 
 def test_a_model_that_is_right_has_no_gap(bench):

@@ -45,8 +45,9 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
     still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
-    movable = {place.location for place in _named_locations(result)[:1]} - still
-    most = f"Record slow and fast motions, with pauses, and most motion at {''.join(movable)} (where the gap is)."
+    first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
+    movable = " or ".join([name for name in first if name not in still])
+    most = f"Record slow and fast motions, with pauses, and most motion at {movable} (where the gap is)."
     larger = "Record faster and larger motions of all joints, which show more effects."
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
@@ -190,6 +191,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     places = listed([effect.location for effect in alike])
     several = f"{kind} is significant at several locations (p below {level:.2g}): {places}."
     add = f"Add {kind} at {places} under model.effects (friction: as `yid-ocp friction` advises), and repeat "
+    longer = f"To test the rest, raise diagnosis.budget above {result.thresholds.budget} s."
     limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
     laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
@@ -200,10 +202,21 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     links = "The model has too few links. The resulting error is not part of these numbers."
+    predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
+    tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
+    lost = listed([group for group in measured if group not in tested])
+    other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
     rows = [
         (result.unknown_reason, _reason(result)),
+        (lost and tested, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
-        (result.untried, (f"{limit}{listed(result.untried)}.", "Raise diagnosis.budget, to test the rest.")),
+        (
+            result.untried,
+            (
+                f"{limit}{listed(result.untried)}.",
+                longer,
+            ),
+        ),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
@@ -223,7 +236,7 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     names, unsure = listed([entry.effect.label for entry in result.selected_effects]), listed([*sizes])
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
-    stopped = "the time limit ended the search before any effect was tried"
+    stopped = "the time limit ended the search before the model was refitted with any effect"
     tried = "no effect that was tried explains the error well enough"
     apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"less than {limits.min_z:g} ± from no effect, if ± includes the gap"

@@ -76,19 +76,18 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """The result of a null test: chi2 per degree of freedom, p-value, chi2 by channel and tests of time windows."""
+    """The result of a null test: chi2 per degree of freedom, p-value and tests of time windows."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
     p_value: float
-    channel_chi2: dict[str, float]  # mean square of each channel's residual
     windows: tuple[_ResidualWindow, ...]
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
     """Return the noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
     found, told = dict[str, list[Array]](), dict[str, tuple[str, int]]()
-    for episode in problem.episodes:
+    for episode in (*problem.episodes, *problem.held_out):
         for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
@@ -124,11 +123,8 @@ def residual_chi2_null_test(
     degrees = sum(len(s.residual_indices) / _variance_inflation(s.noise_autocorrelation) for s in series)
     effective = max(degrees - parameters, 1.0)
     ratio = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series)) / max(count - parameters, 1)
-    p_value, channels = chi2_p_value(ratio * effective, effective), {}
-    for channel in dict.fromkeys(s.channel for s in series):
-        parts = [residual[s.residual_indices] for s in series if s.channel == channel]
-        channels[channel] = float(np.mean(np.concatenate(parts) ** 2))
-    return NullTestResult(ratio, effective, p_value, channels, _windows(series, residual, level, window))
+    p_value = chi2_p_value(ratio * effective, effective)
+    return NullTestResult(ratio, effective, p_value, _windows(series, residual, level, window))
 
 
 def excess_over_sample_count(residual: Array) -> float:
