@@ -244,6 +244,12 @@ def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is()
         assert "samples of part equal samples of run_1 to the last digit" in duplicate_data_issue(whole, part).what
 
 
+def test_few_samples_of_the_joints_are_serious_and_few_frames_beside_them_are_not():
+    for until, said in ((0.02, [("joints", "not_trusted")]), (0.6, [("points_camera", "warning")])):
+        issues = recording_quality_issues(made().time_slice(0.0, until), lambda _: SensorOptions())
+        assert [(own.group, own.severity) for own in issues if own.cause == "few_samples"] == said
+
+
 def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
     with pytest.raises(ValueError, match="no cause 'bad'"):
         Issue("bad", "", "warning", 1.0, "", "r")

@@ -13,7 +13,7 @@ from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, Issue
+from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
@@ -341,34 +341,8 @@ def _rms_by_channel(sensor: Sensor, square: Array) -> tuple[dict[str, float], Ar
     return {name: float(np.sqrt(np.mean(own))) for name, own in seen if len(own)}, summed
 
 
-def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) -> tuple[str, float, float] | None:
-    """Return the best baseline of all channels, its error and the model's (rms), or None if the model is as good."""
-    rms = {
-        name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
-        for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()
-        if set(channels) <= set(errors)
-    }
-    error = rms.pop("")
-    best = min(rms, key=rms.__getitem__, default=None)
-    return (best, rms[best], error) if best is not None and error > _WORSE_RATIO * rms[best] else None
-
-
-def channels_worse_than_naive_prediction(
-    entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
-) -> list[dict[str, Any]]:
-    """List the channels that a baseline without a model predicts clearly better (by over 5 %) than the model."""
-    worse = []
-    for entry in entries:
-        for channel in entry["rmse"]:
-            if better := _clearly_better_baseline(entry, [channel]):
-                said = {"recording": entry["recording"], "channel": channel}
-                said |= {"unit": channel_or_group_unit(units, channel)}
-                worse.append(said | dict(zip(("baseline", "guess", "rmse"), better, strict=True)))
-    return worse
-
-
 def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
-    """Return an issue for each sensor that a baseline predicts better than the model, over all its channels."""
+    """Return an issue for each sensor that the best baseline predicts better than the model, over all its channels."""
     found = []
     for entry in entries:
         groups: dict[str, list[str]] = {}
@@ -376,9 +350,15 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             if channel in units:  # not the sum over a group
                 groups.setdefault(channel.rpartition(".")[0], []).append(channel)
         for group, channels in groups.items():
-            if better := _clearly_better_baseline(entry, channels):
-                best, guess, error = better
-                unit = units[channels[0]]
+            rms = {
+                name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
+                for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()
+                if set(channels) <= set(errors)
+            }
+            error = rms.pop("")
+            best = min(rms, key=rms.__getitem__, default="")
+            guess, unit = rms.get(best, np.inf), units[channels[0]]
+            if error > _WORSE_RATIO * guess:
                 what = f"the rms error of the model is {error:.3g} {unit}, but the guess '{best}' without a model has "
                 what += f"only {guess:.3g} {unit} (the error of the model may be {_WORSE_RATIO:g} times as large)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
@@ -407,7 +387,7 @@ def _baselines(episode: Episode, samples: SensorMeasurements, cable: CableVertic
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         arrays = naive_cable_predictions(episode.recording, cable, sensor.point_names)
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
-    if not len(samples.value):
+    if len(samples.value) < QUALITY_LIMITS.min_samples:  # a comparison of fewer errors depends on chance
         return {}
     at = np.isfinite(samples.value).argmax(axis=0)[None]
     guess = np.broadcast_to(np.take_along_axis(samples.value, at, axis=0), samples.value.shape).copy()

@@ -77,9 +77,9 @@ def compute_profile_likelihood_interval(
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
-    if walk.base < -0.1 * uncertainty.CHI2_95_TWO_SIDED:
+    if walk.base < -1.0:  # one standard deviation; a smaller difference does not show which value is better
         best = f"{values[np.argmin(deltas)]:.4g}"
-        better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so no value is the best one"
+        better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so the fit missed the best value"
         again = f"Repeat `yid-ocp solve` with --set parameters.{name.partition('[')[0]}.initial={best}"
         walk.notes.append(f"{better}. {again}")
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))

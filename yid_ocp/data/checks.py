@@ -21,6 +21,7 @@ from yid_ocp.data.channel_checks import (
     LIMIT_VIOLATION_RATIO_CAP,
     QUALITY_LIMITS,
     Issue,
+    IssueSeverity,
     SensorOptionsFunction,
     median_sample_period,
 )
@@ -144,12 +145,16 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
 
 
 def _few_samples(recording: Recording) -> Iterator[Issue]:
-    for group in recording.joint_and_point_groups:
-        count, least = len(group.t), QUALITY_LIMITS.min_samples
+    groups, least = recording.joint_and_point_groups, QUALITY_LIMITS.min_samples
+    for group in groups:
+        count = len(group.t)
         if count < least:
+            # angles between so few samples are unknown; a few frames beside a dense group still tell something
+            is_serious = group is recording.joints or all(len(own.t) < least for own in groups)
             what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
-            advice = f"check whether the file is complete. If it is, record until {group.name} has {least} samples"
-            yield Issue("few_samples", what, "warning", least / count, advice, "", group.name)
+            severity: IssueSeverity = "not_trusted" if is_serious else "warning"
+            advice = "check whether the file is complete. If it is, record longer"
+            yield Issue("few_samples", what, severity, least / count, advice, "", group.name)
 
 
 def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Iterator[Issue]:

@@ -480,11 +480,18 @@ VERDICT_TABLE_TEXTS: Mapping[str, str] = {
 """Words for each verdict of a parameter."""
 
 
-def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
-    """Return a sentence that states whether a model explains its recordings, with advice for a poor fit."""
+def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value: float | None = None) -> str:
+    """Return a sentence that states whether a model explains its recordings, with advice for a poor fit.
+
+    A fit with more error than noise alone usually leaves is not called within noise, even if it is not significant.
+    """
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "It is not known whether the model explains the recordings."
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
+    if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
+        chance = "" if p_value is None else f", and at least this with a probability of {p_value:.2g}"
+        said = "It is not certain whether the model explains the recordings: their error is larger than noise, but not"
+        return f"{said} significantly ({size}{chance}). More data can decide this."
     if explains:
         return f"The model explains the recordings to within their noise ({size})."
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."

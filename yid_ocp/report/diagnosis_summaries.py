@@ -40,6 +40,7 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
+_MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits; 0.5 is one standard deviation
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -65,7 +66,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         if place["share"] > _MIN_GAP_SHARE:
             when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
-            rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
+            alike = " or ".join([place["location"], *place["indistinguishable_from"]])
+            rows.append((alike, f"{100 * place['share']:.1f} %", when + more))
     yield SummaryTable(rows, "Where the gap lies")
     rows = [("event", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "its unit")]
     for own in result.get("events", ()):
@@ -310,13 +312,17 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
-    agree = "Use the column `solve`: all methods agree within their ± on the parameters that are found."
+    agree = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are found."
     objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters by method", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    yield "" if result["disturbed"] else f"The method with the lowest cost, {result['reference']}, fits best."
+    costs = [entry["whitened_cost"] for name, entry in methods.items() if name not in stopped]
+    best = f"The method with the lowest cost, {result['reference']}, fits best."
+    if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
+        best = f"All methods fit equally well, because their costs differ by {spread:.1g} at most."
+    yield "" if result["disturbed"] else best
     for name, message in (
         (name, entry["message"]) for name, entry in methods.items() if entry["status"] != "converged"
     ):
@@ -368,7 +374,6 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
     yield from ((key, *(str(entry[key]) for entry in entries)) for key in ("iterations", "evaluations"))
     for words, key in (("wall time [s]", "wall_seconds"), ("CPU time [s]", "cpu_seconds")):
         yield words, *(f"{entry[key]:.2f}" for entry in entries)
-    yield "peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)
 
 
 @register_summary("yid-friction/1")

@@ -48,7 +48,6 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
 _MAX_DIRECTIONS = 8
-_MAX_INITIAL_MISFIT = 30.0  # rms error at initial values, in stds of noise, up to which `check` shows finer models
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
@@ -65,8 +64,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
         yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
-        is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap: " in text for text in predicted)
-        said = goodness_of_fit_message(result["fit"]["chi2_per_dof"], True) if result["fit"]["explains"] else ""
+        is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
+        fit = result["fit"]
+        said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
         found, doubts = (*_found_and_lost(free, is_safe, mild), said), (*notes, *predicted)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
@@ -112,7 +112,7 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
     if not result["fit"]["data_trusted"]:
         steps["estimate again, after the advice above is followed"] = "solve"
-    if not result["fit"]["explains"]:
+    elif not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
@@ -141,8 +141,7 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences that compare the held-out error of a group of channels with noise and with the best baseline.
 
-    A group gets one if the model does not explain the fitted data, or its error is over twice that of noise or fit, or
-    larger than that of the fit mostly by noise of the torques, which carries the arm away.
+    A group gets one if the model does not explain the fitted data, or its error is over twice that of noise.
     """
     for group in dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"]):
         channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
@@ -163,16 +162,14 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         if noise is None or error is None or fitted is None:
             continue
         is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
-        text, rest = f"its rms error is {sizes[0]} on held-out recordings", f"On fitted ones it is {sizes[1]}.{guess}"
+        why = ", mostly because errors of the torques carry the arm away (chi2 accounts for this)" * is_by_torques
+        text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
+        text += f" Noise alone gives {sizes[2]}{why}.{guess}"
+        advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
         if not result["fit"]["explains"]:
-            text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
-            why = ", mostly because errors of the torques carry the arm away (chi2 accounts for this)" * is_by_torques
-            yield f"{text} Noise alone gives {sizes[2]}{why}.{guess}"
+            yield text
         elif error > MAX_NOISE_RATIO * noise:
-            advice = "Run `yid-ocp diagnose` before you use the values, even if their verdict is 'found'."
-            yield f"{group} shows a gap: {text}, over twice the {sizes[2]} that noise alone gives. {advice} {rest}"
-        elif error > (1.0 if is_by_torques else MAX_NOISE_RATIO) * fitted:
-            yield f"{group} shows no gap: {text}; noise alone gives {sizes[2]}, and up to twice this is no gap. {rest}"
+            yield f"{group} shows a gap. Before you use any value, {advice}. {text}"
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -202,6 +199,10 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
     yield f"The last column has the rms error of guesses for comparison: {legend}." if legend else ""
+    moved = ", and errors of the torques that move the arm (a fit estimates them on its own recordings only)"
+    moved *= bool(result.get("torque_offsets"))
+    said = f"noise alone: the error by noise of the sensors{moved}. Up to twice this is no gap."
+    yield said if any(noise is not None for *_, noise, _ in errors) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -234,15 +235,17 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
-    by_bound = dict[str, list[str]]()
+    by_bound = dict[tuple[str, bool], list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
-                by_bound.setdefault(bound, []).append(name)
-    for bound, names in by_bound.items():
+                by_bound.setdefault((bound, entry[side] == 0), []).append(name)
+    for (bound, is_zero), names in by_bound.items():
         what, own = f"{abbreviated_names_text(names)} ended at the {bound}", names[0] if len(names) == 1 else "NAME"
         remedy = f"Widen parameters.{own}.bounds, or fix {own} there if the bound is a physical limit."
+        if is_zero:
+            remedy = f"Fix {own} there (parameters.{own}.free: false) if it is absent. If not, look for another cause."
         yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
 
 
@@ -260,22 +263,26 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
         spread = ("unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
-        value = value_and_uncertainty_text(entry["value"], None, verdict=entry["verdict"])
+        value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
-    said = f"{len(found)} of {len(parameters)} parameters can be found from these recordings (± up to 10 %)"
+    verb = "are expected to be" if is_initial else "can be"
+    said = f"{len(found)} of {len(parameters)} parameters {verb} found from these recordings (± up to 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
-    start = "No fit was made, so the values are initial values. At these, " * is_initial
+    start = "No fit was made: at the initial values, " * is_initial
     doubt = f" Only weakly determined (use the interval): {abbreviated_names_text(weak)}." * bool(weak)
     yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
+    if (std := result.get("grasp_std")) is not None:
+        told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
+        yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
-    legend = "unknown: the ± is infinite, or has no upper end. open: any value is possible. –: no value was found."
-    yield legend if any("unknown" in row for row in rows) else ""
+    meanings = {"unknown": "the ± has no upper end", "open": "any value is possible", "–": "no value is determined"}
+    yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
@@ -306,7 +313,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
         name = f"parameters.{(unseen or lost or weak)[0]}"
-        steps["plan a motion that determines more"] = "plan --set plan.goal=information"
+        if asked and asked["smallest"]:
+            again = f"estimate from FILE, a recording with {asked['smallest'][0]['words']}"
+            steps[again] = "solve --set 'recordings.estimate=[FILE]'"
+        else:
+            steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         steps["fix a parameter whose VALUE is known"] = f"solve --set {name}.free=false --set {name}.initial=VALUE"
         steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
     yield next_steps_table(result, steps)
@@ -378,7 +389,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
-        cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
+        cells = ("unknown" if std is None else f"± {percent_number_text(std)} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
     count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
@@ -406,9 +417,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 @register_summary("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    warnings, misfit, moved = result["warnings"], result["initial_misfit"], discretisation_shift_sentences(result)
-    is_far = misfit is not None and misfit > _MAX_INITIAL_MISFIT
-    coarse = [] if is_far else result["convergence"]["warnings"]
+    warnings, coarse = result["warnings"], result["convergence"]["warnings"]
     severe, mild = (issue_descriptions(result, severe=own) for own in (True, False))
     ended, step = "No problem was found. `solve` can run.", "estimate the free parameters"
     if not result["recordings"]:
@@ -442,10 +451,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    if is_far:
-        yield f"At the initial values, the model error is {misfit:.0f} times the noise, which is usual before a fit."
-    tested = "Links and time steps were tested at the initial values; `solve` repeats this test at its estimates."
-    yield from [tested, *moved] if moved and not is_far else ["`solve` tests links and time steps."] * is_far
+    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TableRows = list[Sequence[str]]
 _MAX_REMEDIES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
+_MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
@@ -165,7 +166,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
 def misfit_summary_blocks(
     result: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]], is_coarse: bool = False
 ) -> SummaryBlockOrTextIterator:
-    """Yield statements on a poor fit: misfit, parameters that are still meaningful, channels worse than a baseline.
+    """Yield statements on a poor fit: misfit, start values to check, and parameters that are still meaningful.
 
     A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value, and
     the model is not `is_coarse`: finer links or time steps explain the recordings no better.
@@ -176,6 +177,7 @@ def misfit_summary_blocks(
         first = "First make the model finer, as follows." if is_coarse else "First follow the advice on the issues."
         said = f"{said.partition(' To find')[0]} {first}" if is_coarse or not fit["data_trusted"] else said
         yield SummaryStatement(said, "conclusion")
+        yield SummaryStatement(_start_value_advice(parameters), "conclusion")
         stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
         values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
         limit, doubted = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD, fit["data_trusted"] and not is_coarse
@@ -183,21 +185,23 @@ def misfit_summary_blocks(
         said = f"Until then, treat these values as rough: {abbreviated_names_text(known)}. Their ± is at most 10 % and "
         said += "includes the model error, but an effect that the model lacks can shift them further."
         yield SummaryStatement(said if known and doubted else "", "conclusion")
-    causes, texts = [entry["cause"] for entry in result.get("issues", ())], list[str]()
-    worse = () if "worse_than_guess" in causes else fit.get("worse_than_guess", ())
-    for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
-        sizes = (" ".join(value_text_and_display_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
-        texts.append(f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} by '{entry['baseline']}'")
-    texts += [f"{left} more in result.json"] if (left := len(worse) - MAX_CHANNELS_SHOWN_SINGLY) > 0 else []
-    said = f"The rms error of these channels is larger than that of a guess without a model: {'; '.join(texts)}."
-    yield SummaryStatement(said if texts else "", "verdict")
+
+
+def _start_value_advice(parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence on undetermined parameters that a poor fit left near their start, empty if there are none."""
+    lost = {
+        name: own for name, own in parameters.items() if own["verdict"] == "not_identifiable" and own.get("initial")
+    }
+    near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
+    names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
+    said = f"First check size and unit of the start values of {names}: there the recordings do not depend on them, so "
+    return f"{said}the fit could not correct a wrong value (parameters.NAME.initial)." if near else ""
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation of a fit that ended: which estimates it shifts too far."""
-    said, cures, free = [], list[str](), result["parameters"] if result["format"] == "yid-solve/1" else {}
-    units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in free.items()}
-    again, wide = (", and solve again", " The ± of the table includes this.") if free else ("", "")
+    said, cures = [], list[str]()
+    units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "encoder noise (sensors.joints.position.std) added once more"
     quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
@@ -210,13 +214,12 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}.{wide}")
+            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The ± of the table includes this.")
         elif tried:
-            is_noted = any(note.lower().startswith(words) for note in result.get("discretisation_notes", ()))
-            quiet.append(words + " (although the errors would fall)" * is_noted)
+            quiet.append(words)
     if quiet:
         said.append(f"With {' or '.join(quiet)}, no estimate would change by more than its ± from the recordings.")
-    return said + ([f"To reduce these errors, set {' and '.join(cures)}{again}."] if cures else [])
+    return said + ([f"To reduce these errors, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
