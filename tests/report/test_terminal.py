@@ -192,7 +192,8 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are"
-    assert told("yid-compare/1", compared())[0] == said
+    lines = told("yid-compare/1", compared())
+    assert (lines[0], "All methods fit equally well, because their costs differ by 0 at most." in lines) == (said, True)
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
@@ -216,7 +217,10 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     assert "No set of up to three changes makes it possible to find all parameters." in lines
     assert "0 of 1 parameters can be found" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
-    assert any("fewest changes that determine all: a weld." in line for line in told("yid-identifiability/1", result))
+    lines = told("yid-identifiability/1", result)
+    assert any("fewest changes that determine all: a weld." in line for line in lines)
+    assert line_of(lines, "estimate from FILE, a recording with a weld").endswith("'recordings.estimate=[FILE]'")
+    assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():

@@ -22,6 +22,7 @@ from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.workflow import diagnose as command
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.prediction_outputs import has_unused_efforts
@@ -155,6 +156,20 @@ def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
             folder.record_run_start(settings, "diagnose")
             written = folder.write_result({})["command"].removesuffix("'")
         assert written == f"yid-ocp diagnose {near}/config.yaml"
+
+
+def test_a_baseline_of_the_command_line_has_its_option_as_place(rubbing, monkeypatch):
+    given = []
+    monkeypatch.setattr(command, "run_command_and_print", lambda _, work: work(None))
+    monkeypatch.setattr(command, "run_diagnose", lambda run, *_: given.append(run))
+    for overrides, flags in (([], ["--baseline"]), (["diagnosis.budget=60"], [])):
+        arguments = SimpleNamespace(config=rubbing, overrides=overrides, baseline=["earlier"], out=None)
+        command.run_and_return_exit_code(arguments)
+        assert given[-1].setting_location("diagnosis", "baseline_run_folders") == "--baseline"
+        assert command._flags(given[-1])[:1] == flags, "an overridden configuration is kept with its baseline"
+    with pytest.raises(ConfigError) as caught:
+        run_diagnose(load_config(rubbing, ["diagnosis.candidates=[friction]"]))
+    assert "joint_coulomb" in caught.value.allowed.split(" and ")[0]
 
 
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])

@@ -26,7 +26,7 @@ from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table_rows
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.check import _input_noise
+from yid_ocp.workflow.check import _input_noise, _too_stiff_start_warnings
 
 
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
@@ -285,3 +285,12 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     assert small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & 1 \\"]
     assert small["values"] == ["T1.bend = 2.2e-05 ± 5e-07"]
     assert copied(system, {}, **lost) == {}
+
+
+def test_a_frequency_that_follows_the_time_step_tells_of_a_start_that_is_too_stiff():
+    known = {"beam.bend": SimpleNamespace(name="beam.bend", unit="N m^2"), "a": SimpleNamespace(name="a", unit="kg")}
+    parameters = type("Parameters", (), {"names": tuple(known), "__getitem__": lambda _, name: known[name]})()
+    system = SimpleNamespace(parameters=parameters)
+    [said] = _too_stiff_start_warnings(system, np.array([1.3e6, 2.0]), 0.005, [98.6], [378.0])
+    assert said.endswith("Check size and unit of the initial values: beam.bend (1.3e+06 N m^2)")
+    assert _too_stiff_start_warnings(system, np.array([1.3, 2.0]), 0.005, [4.0], [4.1]) == []

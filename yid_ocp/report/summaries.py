@@ -351,7 +351,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity / limit", "largest effort / limit")]
     for name, own in result["joints"].items():
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
-        shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
+        shares = ("" if own[key] is None else f"{percent_number_text(own[key])} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
