@@ -175,9 +175,9 @@ def misfit_summary_blocks(
     if not fit["explains"]:
         said = uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False)
         first = "First make the model finer, as follows." if is_coarse else "First follow the advice on the issues."
-        said = f"{said.partition(' To find')[0]} {first}" if is_coarse or not fit["data_trusted"] else said
+        first = first if is_coarse or not fit["data_trusted"] else _start_value_advice(parameters)
+        said = f"{said.partition(' To find')[0]} {first}" if first else said
         yield SummaryStatement(said, "conclusion")
-        yield SummaryStatement(_start_value_advice(parameters), "conclusion")
         stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
         values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
         limit, doubted = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD, fit["data_trusted"] and not is_coarse
@@ -195,7 +195,7 @@ def _start_value_advice(parameters: Mapping[str, Mapping[str, Any]]) -> str:
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
     said = f"First check size and unit of the start values of {names}: there the recordings do not depend on them, so "
-    return f"{said}the fit could not correct a wrong value (parameters.NAME.initial)." if near else ""
+    return f"{said}the fit could not correct a wrong one. If they are right, run `yid-ocp diagnose`." if near else ""
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
