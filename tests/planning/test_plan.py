@@ -219,7 +219,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"target_position": (0.0, 3.0, 0.0)}, ("out of reach", "mm off", "joint's limit", "plan.target_position\n")),
+        ({"target_position": (0.0, 3.0, 0.0)}, ("of reach", "2.34 m off", "joint's limit", "plan.target_position\n")),
         ({"point": "tipp"}, ("no frame 'tipp'", "where: plan.point\n")),
         ({"goal": "box", "frames_in_box": ("tipp",)}, ("no frame 'tipp'", "where: plan.frames_in_box\n")),
         ({"point": None}, ("plan.point is missing",)),
