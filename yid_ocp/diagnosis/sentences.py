@@ -210,13 +210,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (result.unknown_reason, _reason(result)),
         (lost and tested, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
-        (
-            result.untried,
-            (
-                f"{limit}{listed(result.untried)}.",
-                longer,
-            ),
-        ),
+        (result.untried, (f"{limit}{listed(result.untried)}.", longer)),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
