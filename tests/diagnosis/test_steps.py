@@ -133,17 +133,19 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
 def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch):
     """Such as efforts, in which the noise of accelerations depends on the step."""
     problem = Mock(residual_rows=Mock(measurements=[[slice(0, 2), slice(2, 4)]]), step=Mock(time_step=0.01))
-    monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: problem)
     forecast, name = np.array([1.0, 1.0, 9.0, 9.0]), "predicted_refit_residual_at_finer_step"
     monkeypatch.setattr(diagnose.discretisation, name, lambda *_: forecast)
-    fit = Mock(at_estimates=(problem, None, Mock(residual=np.full(4, 2.0))))
-    assert diagnose._fall_at_half_time_step(Mock(), fit, None, False) == pytest.approx(8.0 - 2.0)
+    fall = diagnose.discretisation.predicted_chi2_fall_at_finer_step
+    assert fall(problem, problem, None, Mock(residual=np.full(4, 2.0)), False) == pytest.approx(8.0 - 2.0)
 
 
 def test_a_gap_without_a_cause_is_refitted_with_half_the_time_step(monkeypatch):
     asked, seen = [], Mock(is_corrected_for_links=False)
     seen.evidence.screening.largest_predicted_chi2_decrease, seen.search.thresholds.min_log_bayes_factor = 50.0, 5.0
-    monkeypatch.setattr(diagnose, "_fall_at_half_time_step", lambda *given: asked.append(given[-1]) or 26.0)
+    monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: None)
+    fall = Mock(predicted_chi2_fall_at_finer_step=lambda *given: asked.append(given[-1]) or 26.0)
+    monkeypatch.setattr(diagnose, "discretisation", fall)
+    seen.nominal.at_estimates = ()
     monkeypatch.setattr(diagnose, "_at_half_time_step", lambda *_: "finer")
     for verdict, step, found in (("unknown", 0.005, "finer"), ("no_gap", 0.005, seen), ("unknown", 0.002, seen)):
         seen.nominal.problem.step.time_step = step

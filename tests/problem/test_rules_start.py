@@ -316,10 +316,11 @@ def test_a_recording_starts_in_the_shape_that_its_first_points_show(buckled, whi
     [(_, held)] = problem.predict_held_out(problem.initial_unknowns)
     np.testing.assert_allclose(held.rollout.state[0], states[which - 1], atol=1e-6)
     # a shape found with other parameters may be on the wrong side at these
-    wrong = problem.with_episodes(
-        problem.episodes, [replace(problem.held_out[0], equilibrium_guess=states[2 - which][:11])]
-    )
+    wrong = [replace(problem.episodes[0], equilibrium_guess=states[2 - which][:11])]
+    wrong = problem.with_episodes(wrong, wrong)
     assert np.ptp(wrong.predict_held_out(problem.initial_unknowns)[0][1].rollout.state[0] - states[which - 1]) < 1e-5
+    right = wrong.with_equilibria_near_first_points({}).episodes[0].equilibrium_guess
+    np.testing.assert_allclose(right, states[which - 1][:11], atol=1e-6)
     if which == 2:  # its mirror image is tried, too, where no shape can be fitted; and it stays with other stiffnesses
         fitted = Mock(side_effect=DataError("no shape", hint=""))
         monkeypatch.setattr(InitialStateFitter, "fit_initial_state_to_points", fitted)

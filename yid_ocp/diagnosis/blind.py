@@ -314,7 +314,9 @@ class BlindCaseGenerator:
             except YidError as error:
                 lately = error.what  # this motion cannot be simulated or recorded; draw another
                 continue
-            left_out = (injected[0].kind,) if planned.category == "left_out" else self._other_kind(injected, rng)
+            kinds = sorted({effect.kind for effect in self._effects} - {effect.kind for effect in injected})
+            other = (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
+            left_out = (injected[0].kind,) if planned.category == "left_out" else other
             label = CaseGroundTruth(name, planned.category, injected, multiple, truth, planned.experiment)
             return UnlabelledCase(name, tuple(estimate), held_out, left_out), label
         what = f"MuJoCo simulated none of {MAX_DRAWS_PER_CASE} random motions, lately because {lately}"
@@ -330,10 +332,6 @@ class BlindCaseGenerator:
         purposes = (*(f"estimate_{i}" for i in estimate), "held_out")
         names = (f"case_{planned.number:03d}_{purpose}" for purpose in purposes)
         return [self.simulate_synthetic_recording(truth, injected, rng, name, planned) for name in names]
-
-    def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
-        kinds = sorted({effect.kind for effect in self._effects} - {effect.kind for effect in injected})
-        return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
         self, wanted: PlannedBlindCase, truth: Mapping[str, float], attempt: int, rng: np.random.Generator

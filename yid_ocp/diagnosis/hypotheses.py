@@ -205,16 +205,17 @@ class AllCandidatesProblem:
 
         `effects` are those that are not neutral at `values`.
         """
-        if not self.problem.has_process_noise:
-            return self
+        own = replace(self, problem=self.problem.with_equilibria_near_first_points(values))
+        if not own.problem.has_process_noise:
+            return own
         # filters of the nominal step are those of all candidates, which are neutral
-        made = (self if effects else self.with_step_of_only_effects(())).problem
+        made = (own if effects else own.with_step_of_only_effects(())).problem
         # filters are linearised about the estimated torques, so these must be known first
         x, errors = made.pack_unknowns(values), (episode.input_errors for episode in made.episodes)
         known = all(own is None or np.any(own.torque_noise) for own in errors)
         made = problem_with_held_out_kalman_whitening(problem_with_whitening_at(made, x, rounds=1 if known else 2), x)
         made = problem_with_reestimated_held_out_torque_biases(problem_relinearized_at_torque_bias(made, x, x), x, x)
-        return replace(self, problem=_with_filters_of_part(self.problem, made))
+        return replace(own, problem=_with_filters_of_part(own.problem, made))
 
     @cached_property
     def estimated_at_half_time_step(self) -> EstimationProblem:

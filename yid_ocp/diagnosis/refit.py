@@ -149,8 +149,7 @@ class RefitContext:
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
-    # effects that are refitted in one round, and the number of refits, likewise
-    rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)
+    rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)  # effects, number of refits
 
     def record_stage_end_time(self, name: str) -> None:
         """Record that a stage ends now."""

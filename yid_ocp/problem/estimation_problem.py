@@ -375,6 +375,13 @@ class EstimationProblem(ReprMixin):
         made = self._changed(model_functions=functions, options=options)
         return made.with_episodes(list(map(placed, self.episodes)), ())
 
+    def with_equilibria_near_first_points(self, values: Mapping[str, float]) -> EstimationProblem:
+        """Return a problem in which searches begin in the equilibria that first points show at these parameters."""
+        x, filters = self.pack_unknowns(values), (self.whitening_filters, self.held_out_whitening_filters)
+        thetas = (self.unpack_episode_unknowns(x, i)[0] for i in range(len(self.episodes)))
+        episodes = map(partial(episode_with_equilibrium_guess, self.predictor), self.episodes, thetas)
+        return self.with_episodes(list(episodes), self.held_out, *filters)
+
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """Return a problem with other options, prepared anew from its recordings."""
         known = dict(zip(self.system.parameters.names, self.theta, strict=True))
