@@ -318,6 +318,9 @@ def test_data_suffice_if_samples_outnumber_unknowns_and_a_candidate_is_detectabl
 class Problem:
     """Episodes and held-out ones that can change places."""
 
+    def with_equilibria_near_first_points(self, values):
+        return self
+
     def __init__(self, episodes=("own",), held_out=("other",)):
         self.episodes, self.held_out, self.has_process_noise, self.free = episodes, held_out, False, ("k",)
 
