@@ -494,7 +494,7 @@ def test_a_guess_of_a_cable_covers_the_samples_that_the_model_predicts():
 
 def test_a_guess_is_not_judged_by_the_sample_that_made_it():
     """A point that is seen once makes a guess without an error, which would beat every model."""
-    value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], [np.nan] * 6])
+    value = np.array([[1.0, 1, 1, np.nan, np.nan, np.nan], [2.0, 2, 2, 5, 5, 5], *[[np.nan] * 6] * 2])
     assert errors_of_guess(("p", "q"), value) == pytest.approx(dict.fromkeys(("points.p", "points"), np.sqrt(3)))
 
 

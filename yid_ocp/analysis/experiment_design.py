@@ -239,7 +239,7 @@ class ExperimentVariantSensitivityBuilder:
             try:
                 self._layouts[setup_changes] = self._build(setup_changes)
             except YidError as error:
-                self._layouts[setup_changes] = f"{error.what}. To try it, {error.hint}"
+                self._layouts[setup_changes] = error.what + f". To try it, {error.hint}" * bool(error.hint)
         return self._layouts[setup_changes]
 
     def applicable_setup_changes(self) -> list[str]:
