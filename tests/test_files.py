@@ -133,7 +133,6 @@ OPENED_ELSEWHERE = {
     "cli._discard_what_follows": "/dev/null",
     "cli._reliable_streams": "/dev/null",
     "config.reader._loaded": "a text that was read",
-    "analysis.compare._resident": "/proc",
     "data.recording_hdf5.create_hdf5_atomically": "writes",
     "data.recording_hdf5._complaint": "in the process that is tried first",
     "data.readers.c3d._complaint": "in the process that is tried first",
