@@ -97,7 +97,7 @@ def compare_methods(
         if whole.has_process_noise:
             solution = replace(solution, parameters=uncertainty.mark_free_estimates_not_trusted(solution.parameters))
         taken = time.perf_counter() - wall, time.process_time() - cpu
-        evaluation = problem.evaluate(solution.x)
+        evaluation = problem.evaluate(solution.x, derivatives=own is not problem)
         if own is not problem:  # chi2 of all methods must count the same residual
             fit = uncertainty.assess_goodness_of_fit(problem, evaluation, limits)
             solution = replace(solution, goodness_of_fit=fit)
