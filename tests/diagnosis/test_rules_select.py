@@ -301,8 +301,9 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
     assert rounds.screens == []
 
 
-def test_what_looks_alike_and_was_not_tried_stays_beside_what_was_added(monkeypatch):
-    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1)}, left=1e-3)
+@cases("left, kept", {"noise: what looks alike": (1.0, ["a", "b"]), "a gap: any": (1.5, ["a", "b", "c"])})
+def test_what_was_not_tried_stays_beside_what_was_added_if_it_may_be_better(monkeypatch, left, kept):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (left, 1.1)}, left=1e-3)
     shared = alike(["a@x", "b@x", "c@x"], [[1.0, 0.95, 0.1], [0.95, 1.0, 0.1], [0.1, 0.1, 1.0]])
     monkeypatch.setattr(rounds, "screened", lambda *base: replace(Rounds.screened(rounds, *base), confusability=shared))
     tried = rounds.refit_all
@@ -313,7 +314,7 @@ def test_what_looks_alike_and_was_not_tried_stays_beside_what_was_added(monkeypa
 
     monkeypatch.setattr(select, "refit_with_each_effect", first_alone)
     [entry] = rounds.compose(is_late=True)[2]
-    assert [of.kind for of in entry.equivalent_effects] == ["a", "b"]
+    assert [of.kind for of in entry.equivalent_effects] == kept
 
 
 @cases("cost, goes_on", {"less than three quarters": (12.6, False), "three quarters": (12.5, True)})

@@ -160,6 +160,8 @@ def unknown():
         "stopped with an effect",
         with_effect(FRICTION, 0.5, **hurried | {"untried": ("further effects beside a@x",)}),
     )
+    rivals = {"selected_effects": (added(FRICTION, [OFFSET, joints[1]]),), "untried": (OFFSET.label,)}
+    yield "stopped beside a probable cause", finding("confusable", **hurried | rivals)
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):

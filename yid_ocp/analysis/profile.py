@@ -50,7 +50,8 @@ class ParameterProfileLikelihood:
     upper: float | None  # upper end, likewise
     values: Array  # values at which the other unknowns were refitted, ascending, shape (k,)
     delta_chi2: Array  # (chi2 - best chi2) / max(1, chi2 per dof), shape (k,)
-    notes: tuple[str, ...] = ()  # sentences, for example on a better fit that was found
+    notes: tuple[str, ...] = ()  # sentences on ends of the interval that were not found
+    better_fit: str = ""  # a sentence on a better fit, if one was found
 
     @property
     def interval(self) -> uncertainty.ConfidenceInterval:
@@ -77,12 +78,13 @@ def compute_profile_likelihood_interval(
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
+    better = ""
     if walk.base < -1.0:  # one standard deviation; a smaller difference does not show which value is better
-        best = f"{values[np.argmin(deltas)]:.4g}"
-        better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so the fit missed the best value"
-        again = f"Repeat `yid-ocp solve` with --set parameters.{name.partition('[')[0]}.initial={best}"
-        walk.notes.append(f"{better}. {again}")
-    return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
+        best, setting = f"{values[np.argmin(deltas)]:.4g}", f"parameters.{name.partition('[')[0]}.initial"
+        better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so the fit missed the best value. "
+        better += f"Repeat `yid-ocp solve` with --set {setting}={best}"
+    found = float(x[index]), lower, upper, values, deltas
+    return ParameterProfileLikelihood(name, *found, tuple(walk.notes), better)
 
 
 def solution_with_profile_intervals(
@@ -113,7 +115,7 @@ def solution_with_profile_intervals(
         if entry.verdict != "not_identifiable" and not uncertainty.needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = uncertainty.apply_profile_interval(entry, profile.interval, size)
-            better_fits.extend(f"For {name}, {note}." for note in profile.notes if "better fit" in note)
+            better_fits.extend(f"For {name}, {text}." for text in [profile.better_fit] if text)
         return entry
 
     # each parameter takes about one and a half times as long as the solution

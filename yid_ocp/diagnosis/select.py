@@ -177,10 +177,11 @@ def select_effects(
     near = _near_best_models(nominal, list(single.values()), limits)
     best = next((fit.effects[0].label for fit, _ in near), "")
     while better := next((fit for fit, _ in near if _is_needed(chosen, fit, limits)), None):
-        # untried confusable candidates cannot be excluded yet
-        label = better.effects[-1].label
-        alike = seen.confusability.candidates_confusable_with(label, limits.signature_overlap)
-        untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
+        # untried candidates may be better; where only noise is left, just those that are confusable
+        label, likely = better.effects[-1].label, tuple(own[0].label for own, _ in shortlist)
+        if _leaves_noise(better, limits):
+            likely = seen.confusability.candidates_confusable_with(label, limits.signature_overlap)
+        untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*likely}.intersection(search.skipped)]
         tried = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.effects]
         rivals[label] = [*tried, *untried]
         before, chosen = chosen, better

@@ -104,7 +104,10 @@ def _lead(result: DiagnosisResult) -> str:
     causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
     probable = f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
     none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
-    not_yet = "Do not use the estimates yet, because several causes explain the model's error about equally well."
+    untested = {*result.untried}.intersection(*_rivals(result)[:1])
+    equal = "several causes explain the model's error about equally well"
+    why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
+    not_yet = f"Do not use the estimates yet, because {why}."
     return {
         "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
         "no_gap": none,
@@ -178,8 +181,10 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     lines = [gap_locations_sentence(result, has_origin=True), *_said((closed, closed))]
     lines += [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
     same = "These recordings cannot distinguish"
-    alike = [(others, f"{same} {own} from {listed(others)}.") for own, *others in _rivals(result)]
-    return [*lines, *_said(*alike), *_remains(result)]
+    for own, *others in _rivals(result):
+        tested = [label for label in others if label not in result.untried]
+        lines += _said((tested, f"{same} {own} from {listed(tested)}."))
+    return [*lines, *_remains(result)]
 
 
 def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:

@@ -419,12 +419,13 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     warnings, coarse = result["warnings"], result["convergence"]["warnings"]
     severe, mild = (issue_descriptions(result, severe=own) for own in (True, False))
+    is_advised = bool(severe or result.get("issues") or warnings or coarse)
     ended, step = "No problem was found. `solve` can run.", "estimate the free parameters"
     if not result["recordings"]:
         ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
     if severe:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
-    elif result.get("issues") or warnings or coarse:
+    elif is_advised:
         ended = f"`solve` can run, but its estimates may be poor: read the {'issues' if mild else 'warnings'} below."
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
@@ -459,7 +460,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
-    step += ", after the advice above is followed" * (not ended.startswith("No problem"))
+    step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] else {})
 
 

@@ -187,8 +187,12 @@ def _identifiability_result(
         "directions": [asdict(direction) for direction in information.directions],
         "nuisances": len(information.nuisance_names),
         "profiles": {
-            name: {"values": profile.values, "delta_chi2": profile.delta_chi2, "notes": profile.notes}
-            for name, profile in information.profiles.items()
+            name: {
+                "values": own.values,
+                "delta_chi2": own.delta_chi2,
+                "notes": [t for t in (*own.notes, own.better_fit) if t],
+            }
+            for name, own in information.profiles.items()
         },
     }
 
