@@ -52,6 +52,7 @@ _MIN_TIED_EVIDENCE_RATIO = 0.9  # share of a location's evidence at which an alt
 _MAX_GROUPS = 4  # selected at most
 _MAX_STD_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
+_MIN_EVIDENCE_GAIN_FRACTION = 1e-3  # likewise, of the gain of all iterations
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
@@ -202,12 +203,16 @@ class _State:
 
     models: _Models
     variance: _Variances
-    recordings: tuple[_Smoothed, ...]  # without those whose filter is ill-conditioned
+    recordings: tuple[_Smoothed, ...]  # without those whose filter is ill-conditioned; empty if no longer needed
     shift: Array
     spread: Array
     log_evidence: float
+    # for every group, |score|^2 of its unknowns and the expectation of this number (also for variance zero)
+    scores: dict[SmoothedUnknownGroup, tuple[float, float]]
     # largest log evidence with one more group, and the group's variance
     larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
+    # variances with one more group at the largest evidence, and the result there
+    refined: dict[SmoothedUnknownGroup, tuple[_Variances, _State]] = field(default_factory=dict)
 
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
         """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
@@ -232,7 +237,9 @@ def _run(models: _Models, variance: _Variances) -> _State:
     products = np.sum([done.products for done in filtered], axis=0)
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
     spread = scipy.linalg.cho_solve(information, np.eye(len(shift)))
-    return _State(models, variance, tuple(itertools.chain(*recordings)), shift, spread, evidence)
+    known = tuple(itertools.chain(*recordings))
+    scores = {} if math.isinf(evidence) else _scores(models, known, shift, spread)
+    return _State(models, variance, known, shift, spread, evidence, scores)
 
 
 def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
@@ -248,13 +255,14 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
     return -0.5 * (quadratic + log_determinant + determinant), shift, (factor, True)
 
 
-def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
-    """For every group, |score|^2 of its unknowns and the expectation of this number (also for variance zero)."""
+def _scores(
+    models: _Models, recordings: Sequence[_Smoothed], shift: Array, spread: Array
+) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
     found: dict[SmoothedUnknownGroup, tuple[float, float]] = {}
-    for model, done in zip(models, state.recordings, strict=True):
+    for model, done in zip(models, recordings, strict=True):
         by_theta = done.score[:, :, 1:]
-        score = done.score[:, :, 0] - by_theta @ state.shift
-        information = np.maximum(done.information - np.sum((by_theta @ state.spread) * by_theta, axis=2), 0.0)
+        score = done.score[:, :, 0] - by_theta @ shift
+        information = np.maximum(done.information - np.sum((by_theta @ spread) * by_theta, axis=2), 0.0)
         for source, up, down in zip(model.unknown_groups, np.sum(score**2, 0), np.sum(information, 0), strict=True):
             before = found.get(source, (0.0, 0.0))
             found[source] = before[0] + float(up), before[1] + float(down)
@@ -264,18 +272,19 @@ def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[
 def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
     """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
-    if math.isinf(state.log_evidence):
+    begun = state.log_evidence
+    if math.isinf(begun):
         return variance, state
     for _ in range(_MAX_STD_ITERATIONS):
-        ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in _scores(models, state).items()}
+        ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in state.scores.items()}
         trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
         after = _run(models, trial)
         gained = after.log_evidence - state.log_evidence
         if gained > 0:
             variance, state = trial, after
-        if not gained > _MIN_EVIDENCE_GAIN:
+        if not gained > max(_MIN_EVIDENCE_GAIN, _MIN_EVIDENCE_GAIN_FRACTION * (state.log_evidence - begun)):
             break
-    return variance, state
+    return variance, replace(state, recordings=())
 
 
 def _selected(
@@ -283,7 +292,7 @@ def _selected(
 ) -> tuple[_Variances, float]:
     """Repeatedly add the group that raises the log evidence most, by more than `least`. Variances and evidence."""
     while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
-        found = _scores(models, state)
+        found = state.scores
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))
         if any(variance.values()):
@@ -294,10 +303,12 @@ def _selected(
         (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + least:
             break
-        more, reached_state = _refined(models, variance | {source: size})
-        if math.isinf(reached_state.log_evidence):
+        if source not in state.refined:
+            state.refined[source] = _refined(models, variance | {source: size})
+        more, after = state.refined[source]
+        if math.isinf(after.log_evidence):
             break
-        variance, state = more, reached_state
+        variance, state = more, after
     return variance, state.log_evidence
 
 
@@ -396,7 +407,7 @@ def smooth_unknown_forces_and_biases(
         drop, alternatives = _alternatives(models, variance, nothing, state, least)
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
-        scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
+        scores = {source: max(score, 1e-300) for source, (_, score) in nothing.scores.items()}
         detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / score) for s, score in scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
@@ -453,7 +464,7 @@ def _alternatives(
         less = variance | {source: 0.0}
         without = _run(models, less) if any(less.values()) else nothing
         drop[source] = max(state.log_evidence - without.log_evidence, 0.0)
-        scores = _scores(models, without)
+        scores = without.scores
         # the score at zero variance is a poor predictor here: all groups are tried
         asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         loss = max(least, (1 - _MIN_TIED_EVIDENCE_RATIO) * drop[source])
