@@ -52,7 +52,7 @@ _MIN_TIED_EVIDENCE_RATIO = 0.9  # share of a location's evidence at which an alt
 _MAX_GROUPS = 4  # selected at most
 _MAX_STD_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _MIN_EVIDENCE_GAIN = 0.2  # of an iteration, else it is the last one; groups differ significantly by 5 or more
-_MIN_EVIDENCE_GAIN_FRACTION = 1e-3  # likewise, of the gain of all iterations
+_MIN_EVIDENCE_GAIN_FRACTION = 1e-3  # likewise, of the gain by the group that was added last
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
 _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
@@ -269,11 +269,13 @@ def _scores(
     return found
 
 
-def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
-    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
+def _refined(models: _Models, variance: _Variances, before: float) -> tuple[_Variances, _State]:
+    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation.
+
+    `before` is the log evidence without the group that was added last.
+    """
     state = _run(models, variance)
-    begun = state.log_evidence
-    if math.isinf(begun):
+    if math.isinf(state.log_evidence):
         return variance, state
     for _ in range(_MAX_STD_ITERATIONS):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in state.scores.items()}
@@ -282,7 +284,7 @@ def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]
         gained = after.log_evidence - state.log_evidence
         if gained > 0:
             variance, state = trial, after
-        if not gained > max(_MIN_EVIDENCE_GAIN, _MIN_EVIDENCE_GAIN_FRACTION * (state.log_evidence - begun)):
+        if not gained > max(_MIN_EVIDENCE_GAIN, _MIN_EVIDENCE_GAIN_FRACTION * (state.log_evidence - before)):
             break
     return variance, replace(state, recordings=())
 
@@ -304,7 +306,7 @@ def _selected(
         if not evidence > state.log_evidence + least:
             break
         if source not in state.refined:
-            state.refined[source] = _refined(models, variance | {source: size})
+            state.refined[source] = _refined(models, variance | {source: size}, state.log_evidence)
         more, after = state.refined[source]
         if math.isinf(after.log_evidence):
             break
