@@ -229,8 +229,7 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
         del file["joints"].attrs["effort_kind"]
     result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
     [said] = [text for text in result["warnings"] if "effort_sampling_kind" in text]
-    assert said.startswith("in 'untold', nothing states")
-    assert "so they are taken as samples" in said
+    assert said.startswith("in 'untold', efforts are taken as the torques at the times of the samples, because")
 
 
 def test_check_refines_links_and_time_step(carried_out, written):

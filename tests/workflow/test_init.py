@@ -193,7 +193,7 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
     for end, holder, others in frames:
         (bench / "wrist.urdf").write_text((bench / "wrist.urdf").read_text().replace("</robot>", fixed.format(end)))
         assert proposed(moved(SHORT)).model.object.mount.parent_frame == holder
-        assert f"object held by: {holder} (other frames for --holder: {others})" in capsys.readouterr().out
+        assert f"frame that holds the object: {holder} (other frames for --holder: {others})" in capsys.readouterr().out
 
 
 def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path) -> None:

@@ -89,7 +89,9 @@ def cross_validate_law_by_motion_kind(
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
         if parts is not None:
             error = np.mean([errors[name] for name in own if name in errors])
-            parts.count_done(f"{law} predicts {kind}, not fitted, with an error of {error:.3g} {unit}")
+            parts.count_done(
+                f"law '{law}', fitted without {kind}, predicts {kind} with an rms error of {error:.3g} {unit}"
+            )
     return CrossValidatedFrictionLawFit(law, errors, unit, solution.status.value == "converged")
 
 

@@ -202,6 +202,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each tried finer discretisation of a fit that ended: which estimates it shifts too far."""
     said, cures = [], list[str]()
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
+    estimates = {name: f"estimate: {own['value']:.4g} " for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "encoder noise (sensors.joints.position.std) added once more"
     quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
@@ -210,7 +211,10 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
         moved = {name: own for name, own in tried.items() if abs(own[key]) > own["std"]}
         worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
-        changes = [f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} (± {moved[n]['std']:.2g})" for n in worst]
+        changes = [
+            f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {moved[n]['std']:.2g})"
+            for n in worst
+        ]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []

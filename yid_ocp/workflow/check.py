@@ -124,9 +124,10 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"in '{episode.name}', joints are sampled at {said}")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            said = f"are samples, means or commands, so they are taken as {arm.effort_sampling_kind_or_default}s. If "
-            said += "this is wrong, set sensors.joints.effort.effort_sampling_kind to mean or command"
-            warnings.append(f"in '{episode.name}', nothing states whether efforts {said}")
+            said = "efforts are taken as the torques at the times of the samples, because the recording does not say "
+            said += "what they are. If they are means over the time between samples, or commanded torques, set "
+            said += "sensors.joints.effort.effort_sampling_kind to mean or command"
+            warnings.append(f"in '{episode.name}', {said}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None

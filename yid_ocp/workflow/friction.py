@@ -50,9 +50,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             solution = fit_problem(problem, run.solver, restarts=not problem.system.driven)
             if solution.status == Status.FAILED:
                 for _ in range(1 + len(kinds)):
-                    parts.count_done(f"{law} could not be fitted: {solution.message}")
+                    parts.count_done(f"law '{law}' could not be fitted: {solution.message}")
                 continue
-            parts.count_done(f"{law} is fitted to all motions")
+            parts.count_done(f"law '{law}' is fitted to all motions")
             fits.append(friction_law_comparison.cross_validate_law_by_motion_kind(law, problem, solution, kinds, parts))
             solved[law] = (settings, problem, solution)
         if not fits:

@@ -187,10 +187,11 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "object held by" if proposal.has_object else "no --object is given, so an unknown payload is estimated at"
+    carried = "the object" if proposal.has_object else "an unknown payload, which is estimated (no --object is given)"
     lines = [
         f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"{carried}: {', '.join(held)}" + f" (other frames for --holder: {', '.join(others)})" * bool(others),
+        f"frame that holds {carried}: {', '.join(held)}"
+        + f" (other frames for --holder: {', '.join(others)})" * bool(others),
         f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
         f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
     ]
@@ -207,7 +208,9 @@ def _summary_lines(
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(f"`diagnose` cannot test these effects, because no signal shows them: {', '.join(kinds)}.")
+        lines.append(
+            f"`diagnose` does not test these effects, because no recorded signal shows them: {', '.join(kinds)}."
+        )
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "
