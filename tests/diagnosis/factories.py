@@ -17,7 +17,6 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateDetectability,
-    ConfusabilityMatrix,
     ProjectedCandidatesLinearization,
     ScoreTestResult,
     ScreeningResult,
@@ -101,16 +100,16 @@ def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability
     return CandidateDetectability(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
 
 
-def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:
-    return ConfusabilityMatrix(tuple(labels), np.asarray(matrix, float))
+def alike(labels: Sequence[str], matrix) -> ScreeningResult:
+    """Candidates without scores, and how far they explain each other."""
+    return ScreeningResult(tuple(visible(effect(label)) for label in labels), (), np.asarray(matrix, float), None)
 
 
 def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
     """Candidates that are seen and like no other, unless said."""
-    labels = [entry.effect.label for entry in scores]
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
     joint = SimpleNamespace(rank_candidate_pairs=lambda among: iter(pairs))
-    return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
+    return ScreeningResult(tuple(seen), tuple(scores), np.eye(len(seen)) if table is None else table, joint)
 
 
 def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:

@@ -14,7 +14,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import HeldOutLoss, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
 
@@ -192,7 +192,7 @@ def one_round(nominal, fits, screened=None, **limits):
 
 
 def shortlisted(scores, table, **limits):
-    screened = ScreeningResult((), tuple(scores), table, FEW)
+    screened = replace(table, candidate_scores=tuple(scores), joint_score_model=FEW)
     return [of.kind for (of,), _ in one_round(fit(), [], screened, **limits)[1]]
 
 
@@ -210,7 +210,7 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     many = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, many, n_refit_per_round=2) == ["a", "b", "c", "d"], "as many more, and each once"
-    [((of,), step), *_] = one_round(fit(), [], ScreeningResult((), tuple(scores), many, FEW))[1]
+    [((of,), step), *_] = one_round(fit(), [], replace(many, candidate_scores=tuple(scores), joint_score_model=FEW))[1]
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -305,7 +305,10 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
 def test_what_was_not_tried_stays_beside_what_was_added_if_it_may_be_better(monkeypatch, left, kept):
     rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (left, 1.1)}, left=1e-3)
     shared = alike(["a@x", "b@x", "c@x"], [[1.0, 0.95, 0.1], [0.95, 1.0, 0.1], [0.1, 0.1, 1.0]])
-    monkeypatch.setattr(rounds, "screened", lambda *base: replace(Rounds.screened(rounds, *base), confusability=shared))
+    seen = Rounds.screened
+    monkeypatch.setattr(
+        rounds, "screened", lambda *base: replace(shared, candidate_scores=seen(rounds, *base).candidate_scores)
+    )
     tried = rounds.refit_all
 
     def first_alone(search, base, *rest):
@@ -510,7 +513,7 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
     # the third candidate shows only once two are in the model
-    usual, last = rounds.screened, ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), None)
+    usual, last = rounds.screened, screening([score(C, p=1e-9)])
     monkeypatch.setattr(rounds, "screened", lambda base=(): usual(base) if len(base) < 2 else last)
     first, chosen, added = rounds.compose()
     assert chosen == ["c"]
@@ -565,7 +568,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     asked = []
-    found = screening([score(of) for of in kinds.values()], table=alike([of.label for of in kinds.values()], table))
+    found = screening([score(of) for of in kinds.values()], table=table)
 
     def to_refit(count):
         joint = SimpleNamespace(rank_candidate_pairs=lambda among: asked.append(among) or iter(promised))

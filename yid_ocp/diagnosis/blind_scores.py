@@ -464,7 +464,7 @@ def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
 
 
 def _screening_to_json(screened: screening.ScreeningResult) -> dict[str, Any]:
-    labels, overlaps = screened.confusability.labels, screened.confusability.overlap_fractions
+    labels, overlaps = screened.labels, screened.overlap_fractions
     near = [(i, j, overlaps[i, j]) for i, j in np.argwhere(overlaps >= _MIN_RECORDED_OVERLAP) if i != j]
     scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
     seen = {entry.effect.label: entry.is_detectable for entry in screened.detectability}
@@ -514,9 +514,9 @@ class _RecordedCase:
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
         scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
-        seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
-        confusability = screening.ConfusabilityMatrix(tuple(data["labels"]), overlaps)
-        return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, confusability=confusability)
+        shown = {label: data["detectable"][label] for label in data["labels"]}
+        seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in shown.items())
+        return screening.ScreeningResult(seen, scores, overlaps, EMPTY_SCREENING_RESULT.joint_score_model)
 
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:

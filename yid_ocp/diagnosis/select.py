@@ -151,8 +151,8 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
     """Candidates to refit, with initial values: the best, and as many that are confusable with them."""
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
     best, others = ranked[: limits.n_refit_per_round], ranked[limits.n_refit_per_round :]
-    table, most = screened.confusability, limits.signature_overlap
-    names = {name for s in best for name in table.candidates_confusable_with(s.effect.label, most)}
+    most = limits.signature_overlap
+    names = {name for s in best for name in screened.candidates_confusable_with(s.effect.label, most)}
     alike = [s for s in others if s.effect.label in names][: limits.n_refit_per_round]
     return [((s.effect,), s.predicted_values) for s in (*best, *alike)]
 
@@ -180,7 +180,7 @@ def select_effects(
         # untried candidates may be better; where only noise is left, just those that are confusable
         label, likely = better.effects[-1].label, tuple(own[0].label for own, _ in shortlist)
         if _leaves_noise(better, limits):
-            likely = seen.confusability.candidates_confusable_with(label, limits.signature_overlap)
+            likely = seen.candidates_confusable_with(label, limits.signature_overlap)
         untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*likely}.intersection(search.skipped)]
         tried = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.effects]
         rivals[label] = [*tried, *untried]
@@ -225,7 +225,7 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
     limits, chosen = search.thresholds, list[EffectsWithStart]()
 
     def same(one: EffectBase, other: EffectBase) -> bool:
-        alike = screened.confusability.candidates_confusable_with(one.label, limits.signature_overlap)
+        alike = screened.candidates_confusable_with(one.label, limits.signature_overlap)
         return other.label in (one.label, *alike)
 
     for (a, b), values, _ in search.rank_candidate_pairs(screened, without.label):
