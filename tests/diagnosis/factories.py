@@ -133,7 +133,7 @@ def costing(cost: float, rows: int) -> Evaluation:
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
-    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system)
+    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system, held_out=())
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
@@ -237,7 +237,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "remaining_test": outcome(p=1e-8, chi2=2.1) if verdict == "unknown" else outcome(p=0.4, chi2=1.02),
         "remaining_gap_locations": (),
         "next_experiment": "Repeat.",
-        "held_out_names": ("other",),
         "is_split_in_blocks": False,
         "thresholds": Thresholds(),
         "stage_seconds": {"nominal_model": 1.0},

@@ -44,7 +44,7 @@ def scored(*p_values):
 
 
 def seen(tests, scores=()):
-    return NominalModelGapEvidence(fit(), *tests, f.screening(scores))
+    return NominalModelGapEvidence(fit(), *tests, f.screening(scores, [f.visible(ONE)]))
 
 
 @cases(
@@ -63,7 +63,7 @@ def seen(tests, scores=()):
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     tests = [f.outcome(p=p, chi2=chi2) for p, chi2 in (before, held_out)]
-    assert seen(tests).may_have_gap(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
+    assert seen(tests).warrants_effect_search(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
 
 
 @cases(
@@ -78,8 +78,10 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
     evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
-    assert (evidence.may_have_gap(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
-    assert not replace(evidence, discretisation_chi2=1e9).may_have_gap(limits), "links and steps may remove it"
+    assert (evidence.warrants_effect_search(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
+    assert not replace(evidence, discretisation_chi2=1e9).warrants_effect_search(limits), (
+        "links and steps may remove it"
+    )
 
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)

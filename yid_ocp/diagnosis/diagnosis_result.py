@@ -39,7 +39,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     nominal_model: RefittedModel
     remaining_test: null_test.NullTestResult  # held-out, with the effects added
     remaining_gap_locations: tuple[GapLocation, ...]
-    held_out_names: tuple[str, ...]
     is_split_in_blocks: bool
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
@@ -96,11 +95,12 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
         noise = {} if self.nominal_model.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
+        held_out = [episode.name for episode in self.nominal_model.problem.held_out]
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",
             **judged,
-            "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names, "noise": noise},
+            "gap": {**judged["gap"], "after": after, "held_out": held_out, "noise": noise},
             "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
             "rejected_candidates": [

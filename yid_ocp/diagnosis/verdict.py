@@ -65,25 +65,23 @@ class NominalModelGapEvidence:
         whole = ExcessResidualCriteria(limits.gap_significance_level, limits.min_excess_chi2_per_dof)
         return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
 
-    def may_have_gap(self, limits: Thresholds) -> bool:
-        """Check whether the residual exceeds noise (in total or along a candidate) or parameters left the baseline.
+    def warrants_effect_search(self, limits: Thresholds) -> bool:
+        """Check whether there may be a gap and the data suffice to search for its cause.
 
-        A gap that parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
+        The residual exceeds noise (in total or along a candidate), or parameters left the baseline. A gap that
+        parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
         """
         scores = self.screening.candidate_scores
         seen = [score for score in scores if score.predicted_chi2_decrease > self.discretisation_chi2]
         is_along_candidate = bonferroni_corrected_min_candidate_p_value(seen) < limits.gap_significance_level
-        return self.has_left_baseline or is_along_candidate or self.residual_exceeds_noise(limits)
+        may_have_gap = self.has_left_baseline or is_along_candidate or self.residual_exceeds_noise(limits)
+        return may_have_gap and self.are_data_sufficient
 
     @property
     def are_data_sufficient(self) -> bool:
         """Whether there are more effective samples than unknowns, and any candidate is detectable."""
         is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         return is_seen and self.nominal_test.degrees_of_freedom > len(self.nominal_model.values)
-
-    def warrants_effect_search(self, limits: Thresholds) -> bool:
-        """Check whether there may be a gap and the data suffice to search for its cause."""
-        return self.may_have_gap(limits) and self.are_data_sufficient
 
 
 @dataclass(frozen=True)
