@@ -147,9 +147,8 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
     problem = problem_of() if problem is None else problem
-    noisy = getattr(problem, "has_process_noise", False)
-    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))
-    return RefittedModel(values, std, p_values, "made up", *rest)
+    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, evaluation([1.0]))
+    return RefittedModel(values, std, p_values, *rest)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> HeldOutGapClosure:

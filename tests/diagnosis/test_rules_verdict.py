@@ -12,7 +12,7 @@ from yid_ocp.diagnosis import verdict as verdict_module
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 
 LIMITS = Thresholds(min_explained_fraction=0.5, min_closure=0.5)
@@ -163,10 +163,12 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 
 def test_equivalent_effects_share_the_probability_of_their_set():
-    entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
-    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9, ())
-    expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
-    assert said.selected_effect_and_equivalent_probabilities == pytest.approx(expected)
+    last, seen = fit([ONE, THIRD]), f.screening([f.score(own) for own in (ONE, OTHER, THIRD)])
+    chosen = (replace(added(ONE, [OTHER], last), shares=(0.7, 0.3)), added(THIRD, fitted=last))
+    told = f.finding("confusable", selected_effects=chosen, single_effect_models=(), screening=seen).to_dict()["which"]
+    assert {own["kind"]: own["probability"] for own in told} == pytest.approx(
+        {ONE.kind: 0.63, OTHER.kind: 0.27, THIRD.kind: 0.9}
+    )
 
 
 @cases(

@@ -175,7 +175,7 @@ def test_a_baseline_of_the_command_line_has_its_option_as_place(rubbing, monkeyp
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])
 def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp_path, caplog):
     made_from = [{"a.h5": "12"}, "a: 1", {"yid-ocp": "1.0"}]
-    refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1}, "done")
+    refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1})
     with atomic_run_folder(load_config(rubbing), tmp_path / "run") as folder:
         first = _SingleJsonFileRefitStore(folder, *made_from)
         first.put("joint_coulomb@elbow", refitted)

@@ -459,8 +459,7 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
-    kept = {entry.name: getattr(fit, entry.name) for entry in fields(RefitStatistics)}
-    return dict(to_lossless_plain_data(kept | {"effects": [effect.label for effect in fit.effects]}))
+    return dict(to_lossless_plain_data(vars(fit.statistics()) | {"effects": [effect.label for effect in fit.effects]}))
 
 
 def _screening_to_json(screened: screening.ScreeningResult) -> dict[str, Any]:

@@ -93,9 +93,10 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
-        noise = {} if self.nominal_model.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
+        problem = self.nominal_model.problem
+        noise = {} if problem.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
-        held_out = [episode.name for episode in self.nominal_model.problem.held_out]
+        held_out = [episode.name for episode in problem.held_out]
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",
@@ -125,7 +126,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. None: not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
-    smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
+    smoothed = None if result.nominal_model.problem.has_process_noise else result.smoother_result
     found = {
         "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
@@ -173,7 +174,8 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     before, last = seen.nominal_model.held_out_loss, [entry.refitted_model for entry in added[-1:]]
     closures = {fit.effects[0].label: null_test.held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
-    probabilities = judged.selected_effect_and_equivalent_probabilities
+    pairs = (pair for e in judged.selected_effects for pair in zip(e.equivalent_effects, e.shares, strict=True))
+    shares = {effect.label: share for effect, share in pairs}
     found = [
         *((e.effect, e.effect.to_reported_parameters(fit.values, fit.std)) for e in added for fit in last),
         *((fit.effects[0], fit.effects[0].to_reported_parameters(fit.values, fit.std)) for fit in alone),
@@ -186,7 +188,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             **attributes_to_dict(effect, _EFFECT_KEYS),
             "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},
             **attributes_to_dict(score, "score=lm_statistic p_value"),
-            "probability": probabilities.get(effect.label, 0.0),
+            "probability": judged.probability * shares.get(effect.label, 0.0),
             **closures.get(effect.label, null_test.UNDEFINED_GAP_CLOSURE).to_dict(),
         }
         listed.setdefault(effect.label, to_json_types(entry))

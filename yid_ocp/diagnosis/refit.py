@@ -42,7 +42,6 @@ class StoredFit:
     values: dict[str, float]  # values of all unknowns
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
     p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
-    solver_message: str  # why the solver ended
 
 
 class RefitStore:
@@ -67,7 +66,6 @@ class RefitStatistics(StoredFit):
     cost: float
     held_out_loss: null_test.HeldOutLoss
     residual_count: int  # number of residuals of the estimation recordings, priors included
-    has_process_noise: bool  # whether errors of torques drive the motion
 
     def statistics(self) -> RefitStatistics:
         """Return the statistics of the refit without its problem and evaluation, which saves memory."""
@@ -256,7 +254,7 @@ def refit_with_effects(
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
     sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
-    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
+    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor))
     store.put(name, found)
     return _model(found, effects, own, finish, problem.held_out_spread)
 
@@ -282,9 +280,8 @@ def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
     x, factor = own.pack_unknowns(known.values), noise_only_covariance_sqrt(own, end)
-    found = tuple(effects), end.cost, null_test.held_out_loss(own, x, factor, spread), len(end.residual)
-    kept = known.values, known.std, known.p_values, known.solver_message
-    return RefittedModel(*kept, *found, own.has_process_noise, own, end)
+    loss, kept = null_test.held_out_loss(own, x, factor, spread), (known.values, known.std, known.p_values)
+    return RefittedModel(*kept, tuple(effects), end.cost, loss, len(end.residual), own, end)
 
 
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:

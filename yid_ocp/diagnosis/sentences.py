@@ -207,6 +207,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     links = "The model has too few links. The resulting error is not part of these numbers."
+    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
@@ -220,11 +221,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (events, (left_out, check)),
+        (divided, (links, f"For other commands, set {divided and divided.setting_text}.")),
     ]
-    if result.is_corrected_for_links:
-        divided = result.nominal_model.problem.options.divided_links_model
-        assert divided is not None  # it gave the correction
-        rows.append((True, (links, f"For other commands, set {divided.setting_text}.")))
     return [text for holds, text in rows if holds]
 
 
@@ -245,11 +243,10 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     none = _said((result.single_effect_models, tried), (result.untried, stopped), (True, tried))[0]
     few += "".join(_said((math.isfinite(closed), end)))
     why, advice = {
-        "": ("", ""),
         "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),
         "little": (f"adding {names} explains only {few}", ""),
         "stand_in": (f"the size of {unsure} is uncertain ({limit}){apart}", again),
-    }[result.unknown_reason]
+    }.get(result.unknown_reason, ("", ""))
     return f"No cause is named, because {why}.", advice
 
 

@@ -123,15 +123,6 @@ class Judgement:
             most = max(part, most)
         return closed
 
-    @property
-    def selected_effect_and_equivalent_probabilities(self) -> dict[str, float]:
-        """The probability that an effect is a cause, by label, for the selected effects and their equivalents."""
-        return {
-            effect.label: self.probability * share
-            for entry in self.selected_effects
-            for effect, share in zip(entry.equivalent_effects, entry.shares, strict=True)
-        }
-
     def explained_and_required_fractions(self, limits: Thresholds) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the explained and the required fraction of the gap, of fitted r'r and of held-out errors.
 
