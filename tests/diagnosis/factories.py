@@ -16,6 +16,7 @@ from yid_ocp.diagnosis import screening as module
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
+    EMPTY_SCREENING_RESULT,
     CandidateDetectability,
     ProjectedCandidatesLinearization,
     ScoreTestResult,
@@ -102,14 +103,14 @@ def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability
 
 def alike(labels: Sequence[str], matrix) -> ScreeningResult:
     """Candidates without scores, and how far they explain each other."""
-    return ScreeningResult(tuple(visible(effect(label)) for label in labels), (), np.asarray(matrix, float), None)
+    return screening(seen=[visible(effect(label)) for label in labels], table=np.asarray(matrix, float))
 
 
-def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
+def screening(scores=(), seen=None, table=None) -> ScreeningResult:
     """Candidates that are seen and like no other, unless said."""
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
-    joint = SimpleNamespace(rank_candidate_pairs=lambda among: iter(pairs))
-    return ScreeningResult(tuple(seen), tuple(scores), np.eye(len(seen)) if table is None else table, joint)
+    table, seen = np.eye(len(seen)) if table is None else table, tuple(seen)
+    return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=tuple(scores), overlap_fractions=table)
 
 
 def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:

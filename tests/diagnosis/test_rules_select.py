@@ -171,9 +171,6 @@ def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
         assert (found.implausible_parameters(of, LIMITS) == []) is plausible
 
 
-FEW = EMPTY_SCREENING_RESULT.joint_score_model
-
-
 def ranked(**decreases):
     return [
         score(effect(f"{name}@x"), p=1e-9, decrease=decrease, step={f"{name}@x.a": decrease})
@@ -192,7 +189,7 @@ def one_round(nominal, fits, screened=None, **limits):
 
 
 def shortlisted(scores, table, **limits):
-    screened = replace(table, candidate_scores=tuple(scores), joint_score_model=FEW)
+    screened = replace(table, candidate_scores=tuple(scores))
     return [of.kind for (of,), _ in one_round(fit(), [], screened, **limits)[1]]
 
 
@@ -210,7 +207,7 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     many = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, many, n_refit_per_round=2) == ["a", "b", "c", "d"], "as many more, and each once"
-    [((of,), step), *_] = one_round(fit(), [], replace(many, candidate_scores=tuple(scores), joint_score_model=FEW))[1]
+    [((of,), step), *_] = one_round(fit(), [], replace(many, candidate_scores=tuple(scores)))[1]
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -562,18 +559,19 @@ def test_a_pair_that_is_no_better_or_of_which_one_is_not_there_is_not_taken(monk
         assert rounds.compose(max_effects=2)[1] == ["a"]
 
 
-def test_pairs_that_others_can_stand_in_for_are_not_refitted():
+def test_pairs_that_others_can_stand_in_for_are_not_refitted(monkeypatch):
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
     promised = [((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     asked = []
     found = screening([score(of) for of in kinds.values()], table=table)
+    name = "rank_candidate_pairs"
+    monkeypatch.setattr(type(found), name, lambda _, among: asked.append(among) or iter(promised))
 
     def to_refit(count):
-        joint = SimpleNamespace(rank_candidate_pairs=lambda among: asked.append(among) or iter(promised))
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
-        return select._pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
+        return select._pairs_to_refit(search, found, kinds["a"])
 
     chosen = to_refit(3)
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]

@@ -515,7 +515,7 @@ class _RecordedCase:
         scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
         shown = {label: data["detectable"][label] for label in data["labels"]}
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in shown.items())
-        return screening.ScreeningResult(seen, scores, overlaps, EMPTY_SCREENING_RESULT.joint_score_model)
+        return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, overlap_fractions=overlaps)
 
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:

@@ -274,9 +274,8 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
         return seen
     problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
-    if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
+    if refitted is None or not (gain := 2 * (fit.cost - refitted.cost)) > least:
         return seen
-    gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
     seen.search.progress.begin_stage(said)
     return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
@@ -376,7 +375,9 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
         # no surer than values change by a law of what is left, or as forecast for an effect
         beside = final.values if law is None else law.model.values
-        changes = {n: max(abs(beside[n] - final.values[n]), abs(forecast.get(n, 0.0))) for n in final.std}
+        changes = {
+            name: max(abs(beside[name] - final.values[name]), abs(forecast.get(name, 0.0))) for name in final.std
+        }
         final = replace(final, std={name: max(std, changes[name]) for name, std in final.std.items()})
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")

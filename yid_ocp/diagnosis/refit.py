@@ -203,7 +203,7 @@ class RefitContext:
     def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
-        ranked = screened.joint_score_model.rank_candidate_pairs
+        ranked = screened.rank_candidate_pairs
         return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:

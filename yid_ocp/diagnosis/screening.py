@@ -219,42 +219,17 @@ ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], flo
 """Two candidates, their values after the step of the linear model, and its decrease of r'r beyond chance."""
 
 
-@dataclass(frozen=True)
-class _JointScoreModel:
-    """A linear model of how the amplitudes of all candidates change the residual, each at one shape value."""
-
-    effects: tuple[EffectBase, ...]
-    shape_values: tuple[dict[str, float], ...]
-    information: Array  # X'X of all signatures side by side, shape (n, n)
-    score_vector: Array  # -X'r, shape (n,)
-
-    @property
-    def _columns(self) -> list[IntArray]:
-        ends = np.cumsum([len(effect.amplitude_parameter_names) for effect in self.effects])
-        return np.split(np.arange(len(self.score_vector)), ends)
-
-    def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
-        """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
-
-        Two effects together can explain a residual that neither explains alone, because each masks the other.
-        """
-        every, labels = zip(self.effects, self.shape_values, self._columns[:-1], strict=True), {*among}
-        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in labels]
-        found: list[ScoredCandidatePair] = []
-        for (one, shape, first, room), (other, its_shape, second, its_room) in itertools.combinations(wanted, 2):
-            at, both = np.concatenate([first, second]), np.concatenate([room, its_room], axis=1)
-            step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], both)
-            values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
-            found.append(((one, other), values | shape | its_shape, decrease - len(at)))
-        return sorted(found, key=lambda pair: -pair[-1])
+def _columns(effects: Sequence[EffectBase]) -> list[IntArray]:
+    """Indices of each effect's amplitudes among those of all."""
+    ends = np.cumsum([0, *(len(effect.amplitude_parameter_names) for effect in effects)])
+    return [np.arange(*own) for own in itertools.pairwise(ends)]
 
 
-def _overlap_fractions(everything: _JointScoreModel) -> Array:
+def _overlap_fractions(effects: Sequence[EffectBase], information: Array) -> Array:
     """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
-    ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_parameter_names]
+    ranges = [effect.prior_ranges[name] for effect in effects for name in effect.amplitude_parameter_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
-    gram = everything.information * scale[:, None] * scale
-    blocks = everything._columns[:-1]
+    gram, blocks = information * scale[:, None] * scale, _columns(effects)
     inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
     matrix = np.zeros((len(blocks), len(blocks)))
     for j, row in enumerate(blocks):
@@ -267,13 +242,18 @@ def _overlap_fractions(everything: _JointScoreModel) -> Array:
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """The detectability, score tests and confusability of all candidates at one point, with their joint model."""
+    """The detectability, score tests and confusability of all candidates at one point.
+
+    A linear model tells how the amplitudes of all candidates, each at one shape value, change the residual.
+    """
 
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[ScoreTestResult, ...]  # of the detectable ones, largest predicted decrease of r'r first
     # shape (nj, nj), in the order of `detectability`: of row j's signature, beyond nominal parameters, by column i's
     overlap_fractions: Array
-    joint_score_model: _JointScoreModel
+    shape_values: tuple[dict[str, float], ...]  # of each candidate
+    information: Array  # X'X of all signatures side by side, shape (n, n)
+    score_vector: Array  # -X'r, shape (n,)
 
     @property
     def largest_predicted_chi2_decrease(self) -> float:
@@ -290,9 +270,24 @@ class ScreeningResult:
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
+    def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
+        """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
-_NO_PAIR = _JointScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
-EMPTY_SCREENING_RESULT = ScreeningResult((), (), np.zeros((0, 0)), _NO_PAIR)
+        Two effects together can explain a residual that neither explains alone, because each masks the other.
+        """
+        effects = [entry.effect for entry in self.detectability]
+        every = zip(effects, self.shape_values, _columns(effects), strict=True)
+        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in among]
+        found: list[ScoredCandidatePair] = []
+        for (one, shape, first, room), (other, its_shape, second, its_room) in itertools.combinations(wanted, 2):
+            at, both = np.concatenate([first, second]), np.concatenate([room, its_room], axis=1)
+            step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], both)
+            values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
+            found.append(((one, other), values | shape | its_shape, decrease - len(at)))
+        return sorted(found, key=lambda pair: -pair[-1])
+
+
+EMPTY_SCREENING_RESULT = ScreeningResult((), (), np.zeros((0, 0)), (), np.zeros((0, 0)), np.zeros(0))
 """Screening where the model cannot be simulated: no candidate is known there."""
 
 
@@ -319,10 +314,9 @@ def screen_candidates(
         kept.append(chosen)
     every = np.hstack([np.zeros((len(residual), 0)), *(own.projected_sensitivity for own in kept)])
     slope = np.concatenate([np.zeros(0), *(own.score_bias for own in kept)]) - every.T @ residual
-    effects, shapes = tuple(own.effect for own in kept), tuple(own.shape_values for own in kept)
-    joint = _JointScoreModel(effects, shapes, every.T @ every, slope)
-    ranked = tuple(sorted(scores, key=lambda own: -own.predicted_chi2_decrease))
-    return ScreeningResult(tuple(visible), ranked, _overlap_fractions(joint), joint)
+    ranked, information = sorted(scores, key=lambda own: -own.predicted_chi2_decrease), every.T @ every
+    overlaps, shapes = _overlap_fractions([own.effect for own in kept], information), (own.shape_values for own in kept)
+    return ScreeningResult(tuple(visible), tuple(ranked), overlaps, tuple(shapes), information, slope)
 
 
 def changes_by_candidates_at_location(

@@ -96,8 +96,8 @@ def _lead(result: DiagnosisResult) -> str:
     gap = _said((exceeds, large), (True, small))[0]
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
     shown = f"would show {sum(seen)} of {len(seen)} effects"
-    degrees = f"{tests[0].degrees_of_freedom:.0f} independent samples"
-    few = f"{degrees} (more than {unknowns}, the number of unknowns, are needed)"
+    degrees = tests[0].degrees_of_freedom
+    few = f"{degrees:.0f} independent samples (more than {unknowns}, the number of unknowns, are needed)"
     is_left = result.remaining_test.p_value < limits.significance_level
     beyond = "".join(_said((is_left, ", but expect errors beyond noise")))
     names = listed([effect.label for effect in result.accepted_effects])
@@ -180,10 +180,9 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     )[0]
     lines = [gap_locations_sentence(result, has_origin=True), *_said((closed, closed))]
     lines += [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
-    same = "These recordings cannot distinguish"
     for own, *others in _rivals(result):
         tested = [label for label in others if label not in result.untried]
-        lines += _said((tested, f"{same} {own} from {listed(tested)}."))
+        lines += _said((tested, f"These recordings cannot distinguish {own} from {listed(tested)}."))
     return [*lines, *_remains(result)]
 
 
@@ -268,14 +267,13 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
-    values, odd = [], []
+    values = []
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
-    for name in fit.implausible_parameters(effect, limits)[-1:]:
-        low, high = effect.prior_ranges[name]
-        where = f"its expected range, {low:.3g} to {high:.3g}"
-        odd.append(f" (far outside {where}, so possibly a substitute for another cause)")
+    ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:]]
+    far, so = " (far outside its expected range", "so possibly a substitute for another cause)"
+    odd = [f"{far}, {low:.3g} to {high:.3g}, {so}" for low, high in ranges]
     unsure = _said((not fit.determines_size(effect, limits.min_z), " (these recordings do not determine its size)"))
     return "".join([f"  {effect.label}: {', '.join(values)}", *odd, *unsure])
 
