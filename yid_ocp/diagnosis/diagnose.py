@@ -374,10 +374,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     if accepted:
         forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
         # no surer than values change by a law of what is left, or as forecast for an effect
-        beside = final.values if law is None else law.model.values
-        changes = {
-            name: max(abs(beside[name] - final.values[name]), abs(forecast.get(name, 0.0))) for name in final.std
-        }
+        at, beside = final.values, final.values if law is None else law.model.values
+        changes = {name: max(abs(beside[name] - at[name]), abs(forecast.get(name, 0.0))) for name in final.std}
         final = replace(final, std={name: max(std, changes[name]) for name, std in final.std.items()})
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")
