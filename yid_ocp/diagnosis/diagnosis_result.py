@@ -11,7 +11,7 @@ from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.gap_law import NonparametricLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import ScoreTestResult, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.screening import ScoreTestResult
 from yid_ocp.diagnosis.select import bic_difference, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
@@ -128,9 +128,9 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
     smoothed = None if result.nominal_model.problem.has_process_noise else result.smoother_result
     found = {
-        "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
+        "p_value": null_test.bonferroni_corrected_min_p_value([test.p_value for test in tests]),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
-        "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
+        "candidate": null_test.bonferroni_corrected_min_p_value([s.p_value for s in result.screening.candidate_scores]),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "explained_fraction": result.explained_fraction,
         "single_effects": {

@@ -175,11 +175,6 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[ScoreTestResult]) -> float:
-    """Return the smallest p-value of the candidates after Bonferroni correction, or 1 if there are no candidates."""
-    return min([1.0, *(score.p_value * len(ranked) for score in ranked)])
-
-
 def _room(effect: EffectBase) -> Array:
     """Largest changes of amplitudes from neutral, downwards and upwards, shape (2, p)."""
     own = [q for q in effect.definitions if not q.is_shape_parameter]

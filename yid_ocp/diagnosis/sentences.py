@@ -8,7 +8,6 @@ import numpy as np
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
@@ -118,15 +117,14 @@ def _lead(result: DiagnosisResult) -> str:
 
 
 def _rivals(result: DiagnosisResult) -> list[list[str]]:
-    """Labels of each accepted effect and of its equivalents."""
     return [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
 
 
 def _best_candidate(result: DiagnosisResult) -> tuple[str, float]:
     """Label of the candidate with the smallest p-value, and this value for as many tries as there are candidates."""
-    scores = result.screening.candidate_scores
-    best = [score.effect.label for score in sorted(scores, key=lambda own: own.p_value)[:1]]
-    return "".join(best), bonferroni_corrected_min_candidate_p_value(scores)
+    scores = sorted(result.screening.candidate_scores, key=lambda own: own.p_value)
+    best = "".join([score.effect.label for score in scores[:1]])
+    return best, null_test.bonferroni_corrected_min_p_value([score.p_value for score in scores])
 
 
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
