@@ -300,7 +300,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
     settings = ("diagnosis.candidates=[joint_coulomb, link_mass@elbow]", "output.write_report=false")
     done = carried_out("diagnose", pendulum, settings=settings)
     assert (done.result["format"], done.result["verdict"]) == ("yid-diagnosis/2", "no_gap")
-    assert "verdict: no gap" in done.out
+    assert "Verdict: no gap" in done.out
     assert {"config.yaml", "log.jsonl", "trajectories.h5"} <= {path.name for path in done.folder.iterdir()}
     with h5py.File(done.folder / "trajectories.h5") as file:
         group = file[f"{done.result['gap']['held_out'][0]}/joints.effort"]
