@@ -567,7 +567,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted(monkeypatch):
     asked = []
     found = screening([score(of) for of in kinds.values()], table=table)
     name = "rank_candidate_pairs"
-    monkeypatch.setattr(type(found), name, lambda _, among: asked.append(among) or iter(promised))
+    monkeypatch.setattr(type(found), name, lambda _, among: asked.append(among) or promised)
 
     def to_refit(count):
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())

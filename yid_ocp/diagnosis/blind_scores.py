@@ -487,7 +487,7 @@ class _RecordedCase:
     """The objects that the rules need, restored from the output of `diagnosis_evidence_to_dict`."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
-        self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
+        self._effects = known = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
@@ -498,10 +498,7 @@ class _RecordedCase:
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
-            {
-                name: tuple(((self._effects[a], self._effects[b]), {}, decrease) for (a, b), decrease in own)
-                for name, own in data["pairs"].items()
-            },
+            {name: [((known[a], known[b]), {}, fall) for (a, b), fall in own] for name, own in data["pairs"].items()},
         )
 
     def _refit(self, data: Mapping[str, Any]) -> RefitStatistics:

@@ -122,8 +122,7 @@ class EffectSearchRecord:
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
-    # by the label of the excluded effect
-    pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(default_factory=dict)
+    pairs: dict[str, list[ScoredCandidatePair]] = field(default_factory=dict)  # by the label of the excluded effect
 
 
 @dataclass(frozen=True)
@@ -200,11 +199,11 @@ class RefitContext:
 
         return self._answer(self.record.screenings, name, screened)
 
-    def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
+    def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
         ranked = screened.rank_candidate_pairs
-        return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
+        return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
         found = work()

@@ -97,8 +97,7 @@ def _lead(result: DiagnosisResult) -> str:
     shown = f"would show {sum(seen)} of {len(seen)} effects"
     degrees = tests[0].degrees_of_freedom
     few = f"{degrees:.0f} independent samples (more than {unknowns}, the number of unknowns, are needed)"
-    is_left = result.remaining_test.p_value < limits.significance_level
-    beyond = "".join(_said((is_left, ", but expect errors beyond noise")))
+    beyond = ", but expect errors beyond noise" * (result.remaining_test.p_value < limits.significance_level)
     names = listed([effect.label for effect in result.accepted_effects])
     causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
     probable = f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
