@@ -348,7 +348,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     last = [nominal, *(entry.refitted_model for entry in accepted)][-1]
     assert isinstance(last, RefittedModel)
     final = reevaluate_refit_with_all_candidates(search.problem, last)
-    if accepted or judged.verdict == "no_gap":
+    if judged.verdict in ("no_gap", "effect", "confusable"):
         fine = _at_finer_step(search, final, events)
         std = discretisation.stds_with_time_step_and_encoder_errors(fine, *final.at_estimates, final.std)
         final, is_counted = replace(final, std=final.std | std), bool(std)
