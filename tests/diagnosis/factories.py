@@ -16,8 +16,8 @@ from yid_ocp.diagnosis import screening as module
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
+    EMPTY_SCREENING_RESULT,
     CandidateDetectability,
-    ConfusabilityMatrix,
     ProjectedCandidatesLinearization,
     ScoreTestResult,
     ScreeningResult,
@@ -101,16 +101,16 @@ def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability
     return CandidateDetectability(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
 
 
-def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:
-    return ConfusabilityMatrix(tuple(labels), np.asarray(matrix, float))
+def alike(labels: Sequence[str], matrix) -> ScreeningResult:
+    """Candidates without scores, and how far they explain each other."""
+    return screening(seen=[visible(effect(label)) for label in labels], table=np.asarray(matrix, float))
 
 
-def screening(scores=(), seen=None, table=None, pairs=()) -> ScreeningResult:
+def screening(scores=(), seen=None, table=None) -> ScreeningResult:
     """Candidates that are seen and like no other, unless said."""
-    labels = [entry.effect.label for entry in scores]
     seen = [visible(entry.effect) for entry in scores] if seen is None else seen
-    joint = SimpleNamespace(rank_candidate_pairs=lambda among: iter(pairs))
-    return ScreeningResult(tuple(seen), tuple(scores), table or alike(labels, np.eye(len(labels))), joint)
+    table, seen = np.eye(len(seen)) if table is None else table, tuple(seen)
+    return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=tuple(scores), overlap_fractions=table)
 
 
 def loss(*means: float, count=100.0, channels=None) -> HeldOutLoss:
@@ -134,7 +134,7 @@ def costing(cost: float, rows: int) -> Evaluation:
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
-    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system)
+    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system, held_out=())
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
@@ -148,9 +148,8 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
     }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
     problem = problem_of() if problem is None else problem
-    noisy = getattr(problem, "has_process_noise", False)
-    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, noisy, problem, evaluation([1.0]))
-    return RefittedModel(values, std, p_values, "made up", *rest)
+    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, evaluation([1.0]))
+    return RefittedModel(values, std, p_values, *rest)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> HeldOutGapClosure:
@@ -238,7 +237,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "remaining_test": outcome(p=1e-8, chi2=2.1) if verdict == "unknown" else outcome(p=0.4, chi2=1.02),
         "remaining_gap_locations": (),
         "next_experiment": "Repeat.",
-        "held_out_names": ("other",),
         "is_split_in_blocks": False,
         "thresholds": Thresholds(),
         "stage_seconds": {"nominal_model": 1.0},

@@ -147,7 +147,7 @@ def test_a_refit_is_evaluated_where_it_ended(solved):
     assert solved.runs == solved.losses == [found.values] == [START]
     assert found.cost == pytest.approx(7.0)
     assert found.std == dict.fromkeys(problem.unknown_names, 0.1)
-    assert (found.effects, found.solver_message) == ((FRICTION,), "done")
+    assert found.effects == (FRICTION,)
     assert problem.warmed == ["there"], "the shape at rest is looked for where it was"
     solved.known = costing(3.0, 10)  # there are no filters to linearise anew
     assert refit_with_effects(problem, [FRICTION], START).cost == 3.0
@@ -218,11 +218,11 @@ def test_a_stalled_search_needs_slopes_that_do_not_follow_each_stair_of_the_cost
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2}, "long ago")})
+    store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2})})
     problem = Problem(lambda values: 5.0)
     found = refit_with_effects(problem, [FRICTION], START, store, FRICTION.label)
     assert solved.runs == []
-    assert (found.values, found.std, found.solver_message) == (values, std, "long ago")
+    assert (found.values, found.std, found.p_values) == (values, std, {FRICTION.label: 0.2})
     assert found.p_values == {FRICTION.label: 0.2}
     assert found.cost == pytest.approx(5.0)
     assert solved.losses == [values]
@@ -235,12 +235,12 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
 
 
 def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
-    store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2}, "")})
+    store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2})})
     found = refit_with_effects(
         Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store, FRICTION.label
     )
     assert solved.runs == [found.values] == [START]
-    assert store["friction@elbow at 0.01 s"].solver_message == "done"
+    assert store["friction@elbow at 0.01 s"].values == found.values
 
 
 def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):

@@ -14,7 +14,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScreeningResult
+from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import HeldOutLoss, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
 
@@ -171,9 +171,6 @@ def test_a_value_that_may_as_well_lie_within_is_not_out_of_its_range():
         assert (found.implausible_parameters(of, LIMITS) == []) is plausible
 
 
-FEW = EMPTY_SCREENING_RESULT.joint_score_model
-
-
 def ranked(**decreases):
     return [
         score(effect(f"{name}@x"), p=1e-9, decrease=decrease, step={f"{name}@x.a": decrease})
@@ -192,7 +189,7 @@ def one_round(nominal, fits, screened=None, **limits):
 
 
 def shortlisted(scores, table, **limits):
-    screened = ScreeningResult((), tuple(scores), table, FEW)
+    screened = replace(table, candidate_scores=tuple(scores))
     return [of.kind for (of,), _ in one_round(fit(), [], screened, **limits)[1]]
 
 
@@ -210,7 +207,7 @@ def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     many = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, many, n_refit_per_round=2) == ["a", "b", "c", "d"], "as many more, and each once"
-    [((of,), step), *_] = one_round(fit(), [], ScreeningResult((), tuple(scores), many, FEW))[1]
+    [((of,), step), *_] = one_round(fit(), [], replace(many, candidate_scores=tuple(scores)))[1]
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -305,7 +302,10 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
 def test_what_was_not_tried_stays_beside_what_was_added_if_it_may_be_better(monkeypatch, left, kept):
     rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (left, 1.1)}, left=1e-3)
     shared = alike(["a@x", "b@x", "c@x"], [[1.0, 0.95, 0.1], [0.95, 1.0, 0.1], [0.1, 0.1, 1.0]])
-    monkeypatch.setattr(rounds, "screened", lambda *base: replace(Rounds.screened(rounds, *base), confusability=shared))
+    seen = Rounds.screened
+    monkeypatch.setattr(
+        rounds, "screened", lambda *base: replace(shared, candidate_scores=seen(rounds, *base).candidate_scores)
+    )
     tried = rounds.refit_all
 
     def first_alone(search, base, *rest):
@@ -510,7 +510,7 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
     # the third candidate shows only once two are in the model
-    usual, last = rounds.screened, ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), None)
+    usual, last = rounds.screened, screening([score(C, p=1e-9)])
     monkeypatch.setattr(rounds, "screened", lambda base=(): usual(base) if len(base) < 2 else last)
     first, chosen, added = rounds.compose()
     assert chosen == ["c"]
@@ -559,18 +559,19 @@ def test_a_pair_that_is_no_better_or_of_which_one_is_not_there_is_not_taken(monk
         assert rounds.compose(max_effects=2)[1] == ["a"]
 
 
-def test_pairs_that_others_can_stand_in_for_are_not_refitted():
+def test_pairs_that_others_can_stand_in_for_are_not_refitted(monkeypatch):
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
     promised = [((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     asked = []
-    found = screening([score(of) for of in kinds.values()], table=alike([of.label for of in kinds.values()], table))
+    found = screening([score(of) for of in kinds.values()], table=table)
+    name = "rank_candidate_pairs"
+    monkeypatch.setattr(type(found), name, lambda _, among: asked.append(among) or promised)
 
     def to_refit(count):
-        joint = SimpleNamespace(rank_candidate_pairs=lambda among: asked.append(among) or iter(promised))
         search = RefitContext(None, Thresholds(n_refit_pairs=count), Heard())
-        return select._pairs_to_refit(search, replace(found, joint_score_model=joint), kinds["a"])
+        return select._pairs_to_refit(search, found, kinds["a"])
 
     chosen = to_refit(3)
     assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]

@@ -12,7 +12,7 @@ from yid_ocp.diagnosis import verdict as verdict_module
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
+from yid_ocp.diagnosis.verdict import NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS
 
 LIMITS = Thresholds(min_explained_fraction=0.5, min_closure=0.5)
@@ -44,7 +44,7 @@ def scored(*p_values):
 
 
 def seen(tests, scores=()):
-    return NominalModelGapEvidence(fit(), *tests, f.screening(scores))
+    return NominalModelGapEvidence(fit(), *tests, f.screening(scores, [f.visible(ONE)]))
 
 
 @cases(
@@ -63,7 +63,7 @@ def seen(tests, scores=()):
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     tests = [f.outcome(p=p, chi2=chi2) for p, chi2 in (before, held_out)]
-    assert seen(tests).may_have_gap(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
+    assert seen(tests).warrants_effect_search(LIMITS) is seen(tests).residual_exceeds_noise(LIMITS) is gap
 
 
 @cases(
@@ -78,8 +78,10 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
     evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
-    assert (evidence.may_have_gap(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
-    assert not replace(evidence, discretisation_chi2=1e9).may_have_gap(limits), "links and steps may remove it"
+    assert (evidence.warrants_effect_search(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
+    assert not replace(evidence, discretisation_chi2=1e9).warrants_effect_search(limits), (
+        "links and steps may remove it"
+    )
 
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
@@ -161,10 +163,12 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 
 def test_equivalent_effects_share_the_probability_of_their_set():
-    entry = replace(added(ONE, [OTHER]), shares=(0.7, 0.3))
-    said = Judgement("confusable", "", (), (entry, added(THIRD)), 1.0, (), 0.9, ())
-    expected = {ONE.label: 0.63, OTHER.label: 0.27, THIRD.label: 0.9}
-    assert said.selected_effect_and_equivalent_probabilities == pytest.approx(expected)
+    last, seen = fit([ONE, THIRD]), f.screening([f.score(own) for own in (ONE, OTHER, THIRD)])
+    chosen = (replace(added(ONE, [OTHER], last), shares=(0.7, 0.3)), added(THIRD, fitted=last))
+    told = f.finding("confusable", selected_effects=chosen, single_effect_models=(), screening=seen).to_dict()["which"]
+    assert {own["kind"]: own["probability"] for own in told} == pytest.approx(
+        {ONE.kind: 0.63, OTHER.kind: 0.27, THIRD.kind: 0.9}
+    )
 
 
 @cases(

@@ -93,7 +93,7 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
         leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
         assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
     # a candidate explains itself, and nothing explains more
-    table = screened_at(point).confusability
+    table = screened_at(point)
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels

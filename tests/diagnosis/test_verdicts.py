@@ -10,7 +10,6 @@ import pytest
 from pendulum_bench import Bench
 
 from yid_ocp.diagnosis.diagnose import diagnose
-from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress
@@ -134,11 +133,9 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     own = {f"joint_coulomb@{joint}": {"tau_c": 0.1} for joint in joints}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
     coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
-    known = NominalSolutionAndRefitStore(
-        store=SimpleNamespace(stored_refit=lambda name: None, put=lambda name, fit: names.append(name))
-    )
+    store = SimpleNamespace(stored_refit=lambda name: None, put=lambda name, fit: names.append(name))
     candidates = ["joint_coulomb", "effort_offset"]
-    finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], known_fits=known)
+    finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], store=store)
     assert (finding.verdict, finding.stated_and_used_time_step) == (verdict, steps)
     assert {effect.label for effect in finding.accepted_effects} == set(own)
     is_finer = steps[0] != steps[1]

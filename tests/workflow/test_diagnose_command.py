@@ -175,7 +175,7 @@ def test_a_baseline_of_the_command_line_has_its_option_as_place(rubbing, monkeyp
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])
 def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp_path, caplog):
     made_from = [{"a.h5": "12"}, "a: 1", {"yid-ocp": "1.0"}]
-    refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1}, "done")
+    refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1})
     with atomic_run_folder(load_config(rubbing), tmp_path / "run") as folder:
         first = _SingleJsonFileRefitStore(folder, *made_from)
         first.put("joint_coulomb@elbow", refitted)
@@ -300,7 +300,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
     settings = ("diagnosis.candidates=[joint_coulomb, link_mass@elbow]", "output.write_report=false")
     done = carried_out("diagnose", pendulum, settings=settings)
     assert (done.result["format"], done.result["verdict"]) == ("yid-diagnosis/2", "no_gap")
-    assert "verdict: no gap" in done.out
+    assert "Verdict: no gap" in done.out
     assert {"config.yaml", "log.jsonl", "trajectories.h5"} <= {path.name for path in done.folder.iterdir()}
     with h5py.File(done.folder / "trajectories.h5") as file:
         group = file[f"{done.result['gap']['held_out'][0]}/joints.effort"]

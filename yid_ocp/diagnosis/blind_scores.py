@@ -459,12 +459,11 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
-    kept = {entry.name: getattr(fit, entry.name) for entry in fields(RefitStatistics)}
-    return dict(to_lossless_plain_data(kept | {"effects": [effect.label for effect in fit.effects]}))
+    return dict(to_lossless_plain_data(vars(fit.statistics()) | {"effects": [effect.label for effect in fit.effects]}))
 
 
 def _screening_to_json(screened: screening.ScreeningResult) -> dict[str, Any]:
-    labels, overlaps = screened.confusability.labels, screened.confusability.overlap_fractions
+    labels, overlaps = screened.labels, screened.overlap_fractions
     near = [(i, j, overlaps[i, j]) for i, j in np.argwhere(overlaps >= _MIN_RECORDED_OVERLAP) if i != j]
     scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
     seen = {entry.effect.label: entry.is_detectable for entry in screened.detectability}
@@ -488,7 +487,7 @@ class _RecordedCase:
     """The objects that the rules need, restored from the output of `diagnosis_evidence_to_dict`."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
-        self._effects = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
+        self._effects = known = {label: _restored_effect(label, own) for label, own in data["effects"].items()}
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
@@ -499,10 +498,7 @@ class _RecordedCase:
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
-            {
-                name: tuple(((self._effects[a], self._effects[b]), {}, decrease) for (a, b), decrease in own)
-                for name, own in data["pairs"].items()
-            },
+            {name: [((known[a], known[b]), {}, fall) for (a, b), fall in own] for name, own in data["pairs"].items()},
         )
 
     def _refit(self, data: Mapping[str, Any]) -> RefitStatistics:
@@ -514,9 +510,9 @@ class _RecordedCase:
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
         scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
-        seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in data["detectable"].items())
-        confusability = screening.ConfusabilityMatrix(tuple(data["labels"]), overlaps)
-        return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, confusability=confusability)
+        shown = {label: data["detectable"][label] for label in data["labels"]}
+        seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in shown.items())
+        return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, overlap_fractions=overlaps)
 
 
 def _restored_effect(label: str, data: Sequence[Mapping[str, Any]]) -> EffectBase:

@@ -25,7 +25,6 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrA
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
     EffectSearchRecord,
-    NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
     RefittedModel,
@@ -44,7 +43,7 @@ from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
-_LOG_PROGRESS, _NOTHING_KNOWN = LoggingProgress(logging.getLogger(__name__)), NominalSolutionAndRefitStore()
+_LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
@@ -58,7 +57,8 @@ def diagnose(
     *,
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
     progress: Progress = _LOG_PROGRESS,
-    known_fits: NominalSolutionAndRefitStore = _NOTHING_KNOWN,
+    solution: Solution | None = None,
+    store: RefitStore = NO_REFIT_STORE,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
@@ -77,6 +77,10 @@ def diagnose(
         Recordings that no fit uses. Default: those of the problem. Without any, alternate blocks are held out.
     progress : Progress
         Default: the package's log.
+    solution : Solution, optional
+        Solution of the nominal model from which its fit starts. Default: it is computed.
+    store : RefitStore
+        Finished refits of an interrupted diagnosis. It receives every new refit. Default: none.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
         them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
@@ -92,11 +96,12 @@ def diagnose(
         problem, earlier = problem_with_priors_and_baseline(problem, baseline)
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         deadline = begun + (thresholds.budget or math.inf)
-        known, count = (known_fits.solution, known_fits.store, thresholds), len(composed.problem.episodes)
-        search = RefitContext(composed, thresholds, progress, known_fits.store, deadline, count, stage_ends={"": begun})
+        count = len(composed.problem.episodes)
+        search = RefitContext(composed, thresholds, progress, store, deadline, count, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
-        return _diagnosed(problem, _examined(search, fit_nominal_model(problem, composed, *known)), earlier)
+        nominal = fit_nominal_model(problem, composed, solution, store, thresholds)
+        return _diagnosed(problem, _examined(search, nominal), earlier)
 
 
 @dataclass(frozen=True)
@@ -259,15 +264,6 @@ def _at_finer_step(search: RefitContext, fit: RefittedModel, events: EventSet) -
     return problem_corrected_for_events(composed.problem_with_nominal_and_effects_free(fit.effects), events)
 
 
-def _with_errors_of_step_and_encoders(
-    search: RefitContext, fit: RefittedModel, events: EventSet
-) -> tuple[RefittedModel, bool]:
-    """The fit with standard deviations that contain these errors, and whether they could be computed."""
-    fine = _at_finer_step(search, fit, events)
-    std = discretisation.stds_with_time_step_and_encoder_errors(fine, *fit.at_estimates, fit.std)
-    return replace(fit, std=fit.std | std), bool(std)
-
-
 def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -> _Examined:
     """The nominal model, examined again on data without the error of the links, if that lowers r'r by so much."""
     seen.search.progress.begin_stage("testing whether twice the links lower chi2", 1.0, 11.0)
@@ -278,9 +274,8 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
         return seen
     problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
-    if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
+    if refitted is None or not (gain := 2 * (fit.cost - refitted.cost)) > least:
         return seen
-    gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
     seen.search.progress.begin_stage(said)
     return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
@@ -348,14 +343,18 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*nominal.at_estimates, least)
         located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
-    remaining, events, final, is_counted = evidence.nominal_held_out_test, seen.events, nominal, False
-    if judged.verdict == "no_gap":
-        final, is_counted = _with_errors_of_step_and_encoders(search, nominal, events)
+    remaining, events, is_counted = evidence.nominal_held_out_test, seen.events, False
+    accepted = judged.accepted_selected_effects
+    last = [nominal, *(entry.refitted_model for entry in accepted)][-1]
+    assert isinstance(last, RefittedModel)
+    final = reevaluate_refit_with_all_candidates(search.problem, last)
+    if judged.verdict in ("no_gap", "effect", "confusable"):
+        fine = _at_finer_step(search, final, events)
+        std = discretisation.stds_with_time_step_and_encoder_errors(fine, *final.at_estimates, final.std)
+        final, is_counted = replace(final, std=final.std | std), bool(std)
+    if not accepted:
         evidence = replace(evidence, nominal_model=final)
-    if accepted := judged.accepted_selected_effects:
-        assert isinstance(accepted[-1].refitted_model, RefittedModel)
-        final = reevaluate_refit_with_all_candidates(search.problem, accepted[-1].refitted_model)
-        final, is_counted = _with_errors_of_step_and_encoders(search, final, events)
+    else:
         fitted, remaining, _ = null_tests_of_fit(*final.at_estimates, limits.significance_level)
         rest = ()
         if null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria):
@@ -374,7 +373,10 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     law = find_gap_law(search, problem.with_replaced_multivariate_prior(prior), final, places, seen.events)
     if accepted:
         forecast = changes_by_candidates_at_location(screened, final.effects, limits.significance_level)
-        final = _no_surer_than_changes(final, final.values if law is None else law.model.values, forecast)
+        # no surer than values change by a law of what is left, or as forecast for an effect
+        at, beside = final.values, final.values if law is None else law.model.values
+        changes = {name: max(abs(beside[name] - at[name]), abs(forecast.get(name, 0.0))) for name in final.std}
+        final = replace(final, std={name: max(std, changes[name]) for name, std in final.std.items()})
         judged = replace(judged, selected_effects=(*accepted[:-1], replace(accepted[-1], refitted_model=final)))
     search.record_stage_end_time("law")
     ends = search.stage_ends
@@ -387,7 +389,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         gap_locations=where,
         remaining_test=remaining,
         remaining_gap_locations=rest,
-        held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
         thresholds=limits,
         truncated_recordings=seen.truncated,
@@ -403,14 +404,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))
     return replace(finding, summary=diagnosis_summary_text(finding))
-
-
-def _no_surer_than_changes(
-    fit: RefittedModel, beside_law: Mapping[str, float], forecast: Mapping[str, float]
-) -> RefittedModel:
-    """The fit with stds of at least the changes of values by a law of what is left, or as forecast for an effect."""
-    changes = {name: max(abs(beside_law[name] - fit.values[name]), abs(forecast.get(name, 0.0))) for name in fit.std}
-    return replace(fit, std={name: max(std, changes[name]) for name, std in fit.std.items()})
 
 
 def _fitted_nominal_model(

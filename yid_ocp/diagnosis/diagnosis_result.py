@@ -11,7 +11,7 @@ from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
 from yid_ocp.diagnosis.gap_law import NonparametricLaw
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import ScoreTestResult, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.screening import ScoreTestResult
 from yid_ocp.diagnosis.select import bic_difference, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
@@ -39,7 +39,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     nominal_model: RefittedModel
     remaining_test: null_test.NullTestResult  # held-out, with the effects added
     remaining_gap_locations: tuple[GapLocation, ...]
-    held_out_names: tuple[str, ...]
     is_split_in_blocks: bool
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]  # duration of each stage [s]
@@ -94,13 +93,15 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         judged = judgement_to_dict(self, self, self.gap_locations)
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
-        noise = {} if self.nominal_model.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
+        problem = self.nominal_model.problem
+        noise = {} if problem.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
+        held_out = [episode.name for episode in problem.held_out]
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
         found = {
             "format": "yid-diagnosis/2",
             **judged,
-            "gap": {**judged["gap"], "after": after, "held_out": self.held_out_names, "noise": noise},
+            "gap": {**judged["gap"], "after": after, "held_out": held_out, "noise": noise},
             "remaining": {"p_value": after["p_value"], "where": left},
             "reason": self.unknown_reason,
             "rejected_candidates": [
@@ -125,11 +126,11 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. None: not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
-    smoothed = None if result.nominal_model.has_process_noise else result.smoother_result
+    smoothed = None if result.nominal_model.problem.has_process_noise else result.smoother_result
     found = {
-        "p_value": null_test.bonferroni_corrected_min_test_p_value(tests),
+        "p_value": null_test.bonferroni_corrected_min_p_value([test.p_value for test in tests]),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
-        "candidate": bonferroni_corrected_min_candidate_p_value(result.screening.candidate_scores),
+        "candidate": null_test.bonferroni_corrected_min_p_value([s.p_value for s in result.screening.candidate_scores]),
         "evidence": None if smoothed is None else max(smoothed.log_evidence.values()),
         "explained_fraction": result.explained_fraction,
         "single_effects": {
@@ -173,7 +174,8 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     before, last = seen.nominal_model.held_out_loss, [entry.refitted_model for entry in added[-1:]]
     closures = {fit.effects[0].label: null_test.held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
-    probabilities = judged.selected_effect_and_equivalent_probabilities
+    pairs = (pair for e in judged.selected_effects for pair in zip(e.equivalent_effects, e.shares, strict=True))
+    shares = {effect.label: share for effect, share in pairs}
     found = [
         *((e.effect, e.effect.to_reported_parameters(fit.values, fit.std)) for e in added for fit in last),
         *((fit.effects[0], fit.effects[0].to_reported_parameters(fit.values, fit.std)) for fit in alone),
@@ -186,7 +188,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             **attributes_to_dict(effect, _EFFECT_KEYS),
             "parameters": {name: attributes_to_dict(own, "value std unit") for name, own in reported.items()},
             **attributes_to_dict(score, "score=lm_statistic p_value"),
-            "probability": probabilities.get(effect.label, 0.0),
+            "probability": judged.probability * shares.get(effect.label, 0.0),
             **closures.get(effect.label, null_test.UNDEFINED_GAP_CLOSURE).to_dict(),
         }
         listed.setdefault(effect.label, to_json_types(entry))

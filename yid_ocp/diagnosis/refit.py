@@ -23,7 +23,7 @@ from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_
 from yid_ocp.parallel import map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.solvers import GaussNewton, Solution, Status
+from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import SolverResult
 
 _SECANT_STDS = 0.4  # half the length of secants, in stds of the unknowns: longer than the steps of a rough cost
@@ -42,7 +42,6 @@ class StoredFit:
     values: dict[str, float]  # values of all unknowns
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite if not informed by the data
     p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
-    solver_message: str  # why the solver ended
 
 
 class RefitStore:
@@ -60,14 +59,6 @@ NO_REFIT_STORE = RefitStore()  # store of a diagnosis that no other one resumes
 
 
 @dataclass(frozen=True)
-class NominalSolutionAndRefitStore:
-    """The results that an interrupted diagnosis left: the nominal solution and the finished refits."""
-
-    solution: Solution | None = None
-    store: RefitStore = NO_REFIT_STORE  # receives every new refit
-
-
-@dataclass(frozen=True)
 class RefitStatistics(StoredFit):
     """The result of a refit without its estimation problem: effects, estimates, cost and held-out errors."""
 
@@ -75,7 +66,6 @@ class RefitStatistics(StoredFit):
     cost: float
     held_out_loss: null_test.HeldOutLoss
     residual_count: int  # number of residuals of the estimation recordings, priors included
-    has_process_noise: bool  # whether errors of torques drive the motion
 
     def statistics(self) -> RefitStatistics:
         """Return the statistics of the refit without its problem and evaluation, which saves memory."""
@@ -132,8 +122,7 @@ class EffectSearchRecord:
 
     refits: dict[str, RefitStatistics | None] = field(default_factory=dict)  # None if the fit failed
     screenings: dict[str, ScreeningResult] = field(default_factory=dict)  # by name; next to effects in the model
-    # by the label of the excluded effect
-    pairs: dict[str, tuple[ScoredCandidatePair, ...]] = field(default_factory=dict)
+    pairs: dict[str, list[ScoredCandidatePair]] = field(default_factory=dict)  # by the label of the excluded effect
 
 
 @dataclass(frozen=True)
@@ -170,7 +159,22 @@ class RefitContext:
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
         """Fit the effects of `fit` again, on the held-out recordings. None if that is not possible."""
         name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
-        return self._answer(self.record.refits, name, lambda: self._turned(fit, name))
+
+        def turned() -> RefittedModel | None:
+            if self.problem.is_split_in_blocks:
+                return None
+            self.progress.begin_stage("fitting the same effects to the held-out recordings", 1.0, 5.5)
+            composed = self._problem_of_round(fit.effects)
+            problem = composed.problem
+            exchanged = problem.with_episodes(problem.held_out, problem.episodes)
+            # parameters shared by both sets of recordings, without initial states
+            names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
+            start = {name: fit.values[name] for name in fit.values.keys() & names}
+            composed = replace(composed, problem=exchanged, held_out_spread=None)
+            whitened = composed.with_whitening_linearized_at(fit.values, fit.effects)
+            return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
+
+        return self._answer(self.record.refits, name, turned)
 
     def _problem_of_round(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
         """The problem with the effects of the first round that has all the given ones, or with all candidates."""
@@ -181,21 +185,6 @@ class RefitContext:
             if has_all and left_out >= _MIN_LEFT_OUT_FOR_OWN_STEP:
                 return self.problem.with_step_of_only_effects(own)
         return self.problem
-
-    def _turned(self, fit: RefitStatistics, name: str) -> RefittedModel | None:
-        """The effects of a fit, refitted with estimation and held-out recordings exchanged."""
-        if self.problem.is_split_in_blocks:
-            return None
-        self.progress.begin_stage("fitting the same effects to the held-out recordings", 1.0, 5.5)
-        composed = self._problem_of_round(fit.effects)
-        problem = composed.problem
-        exchanged = problem.with_episodes(problem.held_out, problem.episodes)
-        turned = replace(composed, problem=exchanged, held_out_spread=None)
-        # parameters shared by both sets of recordings, without initial states
-        names = (*problem.free, *(name for effect in fit.effects for name in effect.parameters.names))
-        start = {name: fit.values[name] for name in fit.values.keys() & names}
-        whitened = turned.with_whitening_linearized_at(fit.values, fit.effects)
-        return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
         """Test all candidates as additions to the effects in `base`. `name` says which fit provides `values`.
@@ -210,11 +199,11 @@ class RefitContext:
 
         return self._answer(self.record.screenings, name, screened)
 
-    def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> tuple[ScoredCandidatePair, ...]:
+    def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
         labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
-        ranked = screened.joint_score_model.rank_candidate_pairs
-        return self._answer(self.record.pairs, without, lambda: tuple(ranked(labels))[:_MAX_RECORDED_PAIRS])
+        ranked = screened.rank_candidate_pairs
+        return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
         found = work()
@@ -264,7 +253,7 @@ def refit_with_effects(
     most = {name: _UNINFORMATIVE_STD_RATIO * (high - low) for name, low, high in ranges}
     sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
-    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor), outcome.message)
+    found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor))
     store.put(name, found)
     return _model(found, effects, own, finish, problem.held_out_spread)
 
@@ -289,10 +278,9 @@ def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: Ref
 def _model(
     known: StoredFit, effects: Sequence[EffectBase], own: EstimationProblem, end: Evaluation, spread: Array | None
 ) -> RefittedModel:
-    kept = (known.values, known.std, known.p_values, known.solver_message, tuple(effects), end.cost)
     x, factor = own.pack_unknowns(known.values), noise_only_covariance_sqrt(own, end)
-    loss = null_test.held_out_loss(own, x, factor, spread)
-    return RefittedModel(*kept, loss, len(end.residual), own.has_process_noise, own, end)
+    loss, kept = null_test.held_out_loss(own, x, factor, spread), (known.values, known.std, known.p_values)
+    return RefittedModel(*kept, tuple(effects), end.cost, loss, len(end.residual), own, end)
 
 
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:

@@ -55,14 +55,6 @@ class ProjectedCandidatesLinearization:
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
 
-    @property
-    def _grids(self) -> list[list[_EffectSignature]]:
-        """The signatures of each candidate, one per grid value."""
-        grids: dict[str, list[_EffectSignature]] = {}
-        for own in self.signatures:
-            grids.setdefault(own.effect.label, []).append(own)
-        return list(grids.values())
-
 
 @dataclass(frozen=True)
 class CandidateDetectability:
@@ -183,26 +175,6 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _score_candidates(
-    point: ProjectedCandidatesLinearization,
-    series: Sequence[OutputResidualIndices],
-    visible: Sequence[CandidateDetectability],
-) -> tuple[ScoreTestResult, ...]:
-    """Score every detectable candidate, largest predicted decrease of r'r first."""
-    found = []
-    for grid in (own for entry, own in zip(visible, point._grids, strict=True) if entry.is_detectable):
-        tried = [_score(signature, point.projected_residual, series) for signature in grid]
-        # shape values that make no difference differ by rounding alone: the first one stays
-        best = max(tried, key=lambda s: float(f"{s.predicted_chi2_decrease:.6g}"))
-        found.append(replace(best, p_value=min(1.0, best.p_value * len(tried))))
-    return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
-
-
-def bonferroni_corrected_min_candidate_p_value(ranked: Sequence[ScoreTestResult]) -> float:
-    """Return the smallest p-value of the candidates after Bonferroni correction, or 1 if there are no candidates."""
-    return min([1.0, *(score.p_value * len(ranked) for score in ranked)])
-
-
 def _room(effect: EffectBase) -> Array:
     """Largest changes of amplitudes from neutral, downwards and upwards, shape (2, p)."""
     own = [q for q in effect.definitions if not q.is_shape_parameter]
@@ -238,44 +210,69 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     return {n: effect.neutral_values[n] + float(x) for n, x in zip(effect.amplitude_parameter_names, step, strict=True)}
 
 
-@dataclass(frozen=True)
-class ConfusabilityMatrix:
-    """The fraction of each candidate's signature that each other candidate explains, beyond nominal parameters."""
+ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
+"""Two candidates, their values after the step of the linear model, and its decrease of r'r beyond chance."""
 
-    labels: tuple[str, ...]
-    overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
+
+def _columns(effects: Sequence[EffectBase]) -> list[IntArray]:
+    """Indices of each effect's amplitudes among those of all."""
+    ends = np.cumsum([0, *(len(effect.amplitude_parameter_names) for effect in effects)])
+    return [np.arange(*own) for own in itertools.pairwise(ends)]
+
+
+def _overlap_fractions(effects: Sequence[EffectBase], information: Array) -> Array:
+    """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
+    ranges = [effect.prior_ranges[name] for effect in effects for name in effect.amplitude_parameter_names]
+    scale = np.array([(high - low) / 2 for low, high in ranges])
+    gram, blocks = information * scale[:, None] * scale, _columns(effects)
+    inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
+    matrix = np.zeros((len(blocks), len(blocks)))
+    for j, row in enumerate(blocks):
+        size = max(float(np.trace(gram[np.ix_(row, row)])), 1e-300)
+        for i, column in enumerate(blocks):
+            cross = gram[np.ix_(row, column)]
+            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
+    return np.clip(matrix, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ScreeningResult:
+    """The detectability, score tests and confusability of all candidates at one point.
+
+    A linear model tells how the amplitudes of all candidates, each at one shape value, change the residual.
+    """
+
+    detectability: tuple[CandidateDetectability, ...]
+    candidate_scores: tuple[ScoreTestResult, ...]  # of the detectable ones, largest predicted decrease of r'r first
+    # shape (nj, nj), in the order of `detectability`: of row j's signature, beyond nominal parameters, by column i's
+    overlap_fractions: Array
+    shape_values: tuple[dict[str, float], ...]  # of each candidate
+    information: Array  # X'X of all signatures side by side, shape (n, n)
+    score_vector: Array  # -X'r, shape (n,)
+
+    @property
+    def largest_predicted_chi2_decrease(self) -> float:
+        """The largest decrease of r'r that the linear model predicts for one candidate; 0 without candidates."""
+        return max((score.predicted_chi2_decrease for score in self.candidate_scores), default=0.0)
+
+    @property
+    def labels(self) -> list[str]:
+        """The labels of all candidates."""
+        return [entry.effect.label for entry in self.detectability]
 
     def candidates_confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
         """List the other candidates that explain at least the fraction `limit` of the signature of `label`."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
-
-ScoredCandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
-"""Two candidates, their values after the step of the linear model, and its decrease of r'r beyond chance."""
-
-
-@dataclass(frozen=True)
-class _JointScoreModel:
-    """A linear model of how the amplitudes of all candidates change the residual, each at one shape value."""
-
-    effects: tuple[EffectBase, ...]
-    shape_values: tuple[dict[str, float], ...]
-    information: Array  # X'X of all signatures side by side, shape (n, n)
-    score_vector: Array  # -X'r, shape (n,)
-
-    @property
-    def _columns(self) -> list[IntArray]:
-        ends = np.cumsum([len(effect.amplitude_parameter_names) for effect in self.effects])
-        return np.split(np.arange(len(self.score_vector)), ends)
-
     def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
         """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
-        every, labels = zip(self.effects, self.shape_values, self._columns[:-1], strict=True), {*among}
-        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in labels]
+        effects = [entry.effect for entry in self.detectability]
+        every = zip(effects, self.shape_values, _columns(effects), strict=True)
+        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in among]
         found: list[ScoredCandidatePair] = []
         for (one, shape, first, room), (other, its_shape, second, its_room) in itertools.combinations(wanted, 2):
             at, both = np.concatenate([first, second]), np.concatenate([room, its_room], axis=1)
@@ -285,53 +282,7 @@ class _JointScoreModel:
         return sorted(found, key=lambda pair: -pair[-1])
 
 
-def _joint_score_model(point: ProjectedCandidatesLinearization, chosen: Sequence[ScoreTestResult]) -> _JointScoreModel:
-    """Make the joint linear model of all candidates, at shape values of `chosen` or the middle of the grid."""
-    shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
-    kept = []
-    for grid in point._grids:
-        known = shape.get(grid[0].effect.label)
-        kept.append(next((s for s in grid if s.shape_values == known), grid[len(grid) // 2]))
-    every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
-    effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
-    bias = np.concatenate([np.zeros(0), *(s.score_bias for s in kept)])
-    return _JointScoreModel(effects, shapes, every.T @ every, bias - every.T @ point.projected_residual)
-
-
-def _confusability_matrix(everything: _JointScoreModel) -> ConfusabilityMatrix:
-    """Fractions of signatures that candidates explain of each other, with amplitudes scaled by prior range."""
-    ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_parameter_names]
-    scale = np.array([(high - low) / 2 for low, high in ranges])
-    gram = everything.information * scale[:, None] * scale
-    blocks = everything._columns[:-1]
-    inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
-    matrix = np.zeros((len(blocks), len(blocks)))
-    for j, row in enumerate(blocks):
-        size = max(float(np.trace(gram[np.ix_(row, row)])), 1e-300)
-        for i, column in enumerate(blocks):
-            cross = gram[np.ix_(row, column)]
-            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
-    return ConfusabilityMatrix(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
-
-
-@dataclass(frozen=True)
-class ScreeningResult:
-    """The detectability, score tests and confusability of all candidates at one point, with their joint model."""
-
-    detectability: tuple[CandidateDetectability, ...]
-    candidate_scores: tuple[ScoreTestResult, ...]  # best first
-    confusability: ConfusabilityMatrix
-    joint_score_model: _JointScoreModel
-
-    @property
-    def largest_predicted_chi2_decrease(self) -> float:
-        """The largest decrease of r'r that the linear model predicts for one candidate; 0 without candidates."""
-        return max((score.predicted_chi2_decrease for score in self.candidate_scores), default=0.0)
-
-
-EMPTY_SCREENING_RESULT = ScreeningResult(
-    (), (), ConfusabilityMatrix((), np.zeros((0, 0))), _JointScoreModel((), (), np.zeros((0, 0)), np.zeros(0))
-)
+EMPTY_SCREENING_RESULT = ScreeningResult((), (), np.zeros((0, 0)), (), np.zeros((0, 0)), np.zeros(0))
 """Screening where the model cannot be simulated: no candidate is known there."""
 
 
@@ -340,12 +291,27 @@ def screen_candidates(
 ) -> ScreeningResult:
     """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
     point = linearize_candidates(problem, base, values)
-    found = (map(_detectability, grid) for grid in point._grids)
-    # the smallest amplitude of each that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
-    visible = tuple(min(e, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values()))) for e in found)
-    ranked = _score_candidates(point, channels_with_residual_indices(problem.problem), visible)
-    everything = _joint_score_model(point, ranked)
-    return ScreeningResult(visible, ranked, _confusability_matrix(everything), everything)
+    series, residual = channels_with_residual_indices(problem.problem), point.projected_residual
+    grids = dict[str, list[_EffectSignature]]()
+    for own in point.signatures:
+        grids.setdefault(own.effect.label, []).append(own)
+    visible, scores, kept = list[CandidateDetectability](), list[ScoreTestResult](), list[_EffectSignature]()
+    for grid in grids.values():
+        # the smallest amplitude that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
+        found = map(_detectability, grid)
+        visible.append(min(found, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values()))))
+        chosen = grid[len(grid) // 2]
+        if visible[-1].is_detectable:
+            tried = [(_score(signature, residual, series), signature) for signature in grid]
+            # shape values that make no difference differ by rounding alone: the first one stays
+            best, chosen = max(tried, key=lambda own: float(f"{own[0].predicted_chi2_decrease:.6g}"))
+            scores.append(replace(best, p_value=min(1.0, best.p_value * len(tried))))
+        kept.append(chosen)
+    every = np.hstack([np.zeros((len(residual), 0)), *(own.projected_sensitivity for own in kept)])
+    slope = np.concatenate([np.zeros(0), *(own.score_bias for own in kept)]) - every.T @ residual
+    ranked, information = sorted(scores, key=lambda own: -own.predicted_chi2_decrease), every.T @ every
+    overlaps, shapes = _overlap_fractions([own.effect for own in kept], information), (own.shape_values for own in kept)
+    return ScreeningResult(tuple(visible), tuple(ranked), overlaps, tuple(shapes), information, slope)
 
 
 def changes_by_candidates_at_location(

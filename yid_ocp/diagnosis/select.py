@@ -151,8 +151,8 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
     """Candidates to refit, with initial values: the best, and as many that are confusable with them."""
     ranked = [score for score in screened.candidate_scores if score.p_value < limits.significance_level]
     best, others = ranked[: limits.n_refit_per_round], ranked[limits.n_refit_per_round :]
-    table, most = screened.confusability, limits.signature_overlap
-    names = {name for s in best for name in table.candidates_confusable_with(s.effect.label, most)}
+    most = limits.signature_overlap
+    names = {name for s in best for name in screened.candidates_confusable_with(s.effect.label, most)}
     alike = [s for s in others if s.effect.label in names][: limits.n_refit_per_round]
     return [((s.effect,), s.predicted_values) for s in (*best, *alike)]
 
@@ -180,18 +180,16 @@ def select_effects(
         # untried candidates may be better; where only noise is left, just those that are confusable
         label, likely = better.effects[-1].label, tuple(own[0].label for own, _ in shortlist)
         if _leaves_noise(better, limits):
-            likely = seen.confusability.candidates_confusable_with(label, limits.signature_overlap)
+            likely = seen.candidates_confusable_with(label, limits.signature_overlap)
         untried = [(own[0], 0.0) for own, _ in shortlist if own[0].label in {*likely}.intersection(search.skipped)]
         tried = [(fit.effects[-1], distance) for fit, distance in near if fit.effects[:-1] == chosen.effects]
         rivals[label] = [*tried, *untried]
-        before, chosen = chosen, better
-        base = better.effects
+        before, chosen, base = chosen, better, better.effects
         beside = join_effect_labels(base)
         closed = null_test.held_out_gap_closure(nominal.held_out_loss, better.held_out_loss)
         rest = f"further effects beside {beside}"
         search.progress.begin_stage(f"the model now has {beside} ({closed.text})".removesuffix(" ()"))
-        is_full = len(base) >= limits.max_effects
-        if is_full or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
+        if len(base) >= limits.max_effects or _leaves_noise(better, limits) or search.is_skipped_past_deadline(rest):
             break
         search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
@@ -222,17 +220,13 @@ def select_effects(
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:
     """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
-    limits, chosen = search.thresholds, list[EffectsWithStart]()
-
-    def same(one: EffectBase, other: EffectBase) -> bool:
-        alike = screened.confusability.candidates_confusable_with(one.label, limits.signature_overlap)
-        return other.label in (one.label, *alike)
-
-    for (a, b), values, _ in search.rank_candidate_pairs(screened, without.label):
-        before = [order for pair, _ in chosen for order in (pair, pair[::-1])]
-        if not any(same(a, c) and same(b, d) for c, d in before):
-            chosen.append(((a, b), values))
-    return chosen[: limits.n_refit_pairs]
+    chosen, most = list[EffectsWithStart](), search.thresholds.signature_overlap
+    for pair, values, _ in search.rank_candidate_pairs(screened, without.label):
+        one, other = ({own.label, *screened.candidates_confusable_with(own.label, most)} for own in pair)
+        before = [order for known, _ in chosen for order in (known, known[::-1])]
+        if not any(a.label in one and b.label in other for a, b in before):
+            chosen.append((pair, values))
+    return chosen[: search.thresholds.n_refit_pairs]
 
 
 def _reconsidered(

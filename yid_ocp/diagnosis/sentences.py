@@ -8,7 +8,6 @@ import numpy as np
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.screening import bonferroni_corrected_min_candidate_p_value
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
@@ -96,10 +95,9 @@ def _lead(result: DiagnosisResult) -> str:
     gap = _said((exceeds, large), (True, small))[0]
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
     shown = f"would show {sum(seen)} of {len(seen)} effects"
-    degrees = f"{tests[0].degrees_of_freedom:.0f} independent samples"
-    few = f"{degrees} (more than {unknowns}, the number of unknowns, are needed)"
-    is_left = result.remaining_test.p_value < limits.significance_level
-    beyond = "".join(_said((is_left, ", but expect errors beyond noise")))
+    degrees = tests[0].degrees_of_freedom
+    few = f"{degrees:.0f} independent samples (more than {unknowns}, the number of unknowns, are needed)"
+    beyond = ", but expect errors beyond noise" * (result.remaining_test.p_value < limits.significance_level)
     names = listed([effect.label for effect in result.accepted_effects])
     causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
     probable = f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
@@ -118,15 +116,14 @@ def _lead(result: DiagnosisResult) -> str:
 
 
 def _rivals(result: DiagnosisResult) -> list[list[str]]:
-    """Labels of each accepted effect and of its equivalents."""
     return [[effect.label for effect in entry.equivalent_effects] for entry in result.accepted_selected_effects]
 
 
 def _best_candidate(result: DiagnosisResult) -> tuple[str, float]:
     """Label of the candidate with the smallest p-value, and this value for as many tries as there are candidates."""
-    scores = result.screening.candidate_scores
-    best = [score.effect.label for score in sorted(scores, key=lambda own: own.p_value)[:1]]
-    return "".join(best), bonferroni_corrected_min_candidate_p_value(scores)
+    scores = sorted(result.screening.candidate_scores, key=lambda own: own.p_value)
+    best = "".join([score.effect.label for score in scores[:1]])
+    return best, null_test.bonferroni_corrected_min_p_value([score.p_value for score in scores])
 
 
 def _why_no_gap(result: DiagnosisResult) -> list[str]:
@@ -180,10 +177,9 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     )[0]
     lines = [gap_locations_sentence(result, has_origin=True), *_said((closed, closed))]
     lines += [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
-    same = "These recordings cannot distinguish"
     for own, *others in _rivals(result):
         tested = [label for label in others if label not in result.untried]
-        lines += _said((tested, f"{same} {own} from {listed(tested)}."))
+        lines += _said((tested, f"These recordings cannot distinguish {own} from {listed(tested)}."))
     return [*lines, *_remains(result)]
 
 
@@ -207,6 +203,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     links = "The model has too few links. The resulting error is not part of these numbers."
+    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
@@ -220,11 +217,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (events, (left_out, check)),
+        (divided, (links, f"For other commands, set {divided and divided.setting_text}.")),
     ]
-    if result.is_corrected_for_links:
-        divided = result.nominal_model.problem.options.divided_links_model
-        assert divided is not None  # it gave the correction
-        rows.append((True, (links, f"For other commands, set {divided.setting_text}.")))
     return [text for holds, text in rows if holds]
 
 
@@ -245,11 +239,10 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     none = _said((result.single_effect_models, tried), (result.untried, stopped), (True, tried))[0]
     few += "".join(_said((math.isfinite(closed), end)))
     why, advice = {
-        "": ("", ""),
         "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),
         "little": (f"adding {names} explains only {few}", ""),
         "stand_in": (f"the size of {unsure} is uncertain ({limit}){apart}", again),
-    }[result.unknown_reason]
+    }.get(result.unknown_reason, ("", ""))
     return f"No cause is named, because {why}.", advice
 
 
@@ -271,14 +264,13 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
-    values, odd = [], []
+    values = []
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
         known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
-    for name in fit.implausible_parameters(effect, limits)[-1:]:
-        low, high = effect.prior_ranges[name]
-        where = f"its expected range, {low:.3g} to {high:.3g}"
-        odd.append(f" (far outside {where}, so possibly a substitute for another cause)")
+    ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:]]
+    far, so = " (far outside its expected range", "so possibly a substitute for another cause)"
+    odd = [f"{far}, {low:.3g} to {high:.3g}, {so}" for low, high in ranges]
     unsure = _said((not fit.determines_size(effect, limits.min_z), " (these recordings do not determine its size)"))
     return "".join([f"  {effect.label}: {', '.join(values)}", *odd, *unsure])
 

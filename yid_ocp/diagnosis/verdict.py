@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
-from yid_ocp.diagnosis.screening import ScreeningResult, bonferroni_corrected_min_candidate_p_value
+from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.null_test import HeldOutGapClosure, NullTestResult, residuals_exceed_noise
+from yid_ocp.inference import null_test
 from yid_ocp.problem.options import ExcessResidualCriteria
-
-_UnknownVerdictReason = Literal["", "none", "little", "stand_in"]
-"""Why the verdict is unknown: no candidate helps, too little is explained, or the size is not known."""
 
 _LOGISTIC_OFFSET, _LOGISTIC_SLOPE = -0.2, 0.8  # of the log odds over the logarithm of what is unexplained
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
@@ -54,8 +50,8 @@ class NominalModelGapEvidence:
     """The evidence for a gap that is known before the search for effects."""
 
     nominal_model: RefitStatistics
-    nominal_test: NullTestResult  # test on the estimation recordings
-    nominal_held_out_test: NullTestResult
+    nominal_test: null_test.NullTestResult  # test on the estimation recordings
+    nominal_held_out_test: null_test.NullTestResult
     screening: ScreeningResult
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
     discretisation_chi2: float = 0.0  # r'r that a finer discretisation may still remove
@@ -63,17 +59,19 @@ class NominalModelGapEvidence:
     def residual_exceeds_noise(self, limits: Thresholds) -> bool:
         """Check whether the residual as a whole exceeds noise by a relevant amount."""
         whole = ExcessResidualCriteria(limits.gap_significance_level, limits.min_excess_chi2_per_dof)
-        return residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
+        return null_test.residuals_exceed_noise((self.nominal_test, self.nominal_held_out_test), whole)
 
-    def may_have_gap(self, limits: Thresholds) -> bool:
-        """Check whether the residual exceeds noise (in total or along a candidate) or parameters left the baseline.
+    def warrants_effect_search(self, limits: Thresholds) -> bool:
+        """Check whether there may be a gap and the data suffice to search for its cause.
 
-        A gap that parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
+        The residual exceeds noise (in total or along a candidate), or parameters left the baseline. A gap that
+        parameters close by leaving the estimates of an earlier run counts only if an effect explains it.
         """
         scores = self.screening.candidate_scores
-        seen = [score for score in scores if score.predicted_chi2_decrease > self.discretisation_chi2]
-        is_along_candidate = bonferroni_corrected_min_candidate_p_value(seen) < limits.gap_significance_level
-        return self.has_left_baseline or is_along_candidate or self.residual_exceeds_noise(limits)
+        seen = [score.p_value for score in scores if score.predicted_chi2_decrease > self.discretisation_chi2]
+        is_along_candidate = null_test.bonferroni_corrected_min_p_value(seen) < limits.gap_significance_level
+        may_have_gap = self.has_left_baseline or is_along_candidate or self.residual_exceeds_noise(limits)
+        return may_have_gap and self.are_data_sufficient
 
     @property
     def are_data_sufficient(self) -> bool:
@@ -81,17 +79,13 @@ class NominalModelGapEvidence:
         is_seen = any(entry.is_detectable for entry in self.screening.detectability)
         return is_seen and self.nominal_test.degrees_of_freedom > len(self.nominal_model.values)
 
-    def warrants_effect_search(self, limits: Thresholds) -> bool:
-        """Check whether there may be a gap and the data suffice to search for its cause."""
-        return self.may_have_gap(limits) and self.are_data_sufficient
-
 
 @dataclass(frozen=True)
 class Judgement:
     """The verdict of a diagnosis and the effects that it selects, with the statistics that support them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
-    unknown_reason: _UnknownVerdictReason
+    unknown_reason: str  # none (no candidate helps), little (is explained) or stand_in (the size is not known)
     single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
     explained_fraction: float  # decrease of r'r by the effects over its excess over noise
@@ -100,7 +94,7 @@ class Judgement:
     confusable_parameter_changes: tuple[str, ...]  # changes since a baseline that explain as much as the effects
 
     @property
-    def closure_by_selected_effects(self) -> HeldOutGapClosure:
+    def closure_by_selected_effects(self) -> null_test.HeldOutGapClosure:
         """The fraction of the gap that all selected effects close together. Undefined without effects."""
         return total_gap_closure(self.selected_effects)
 
@@ -124,15 +118,6 @@ class Judgement:
             closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
             most = max(part, most)
         return closed
-
-    @property
-    def selected_effect_and_equivalent_probabilities(self) -> dict[str, float]:
-        """The probability that an effect is a cause, by label, for the selected effects and their equivalents."""
-        return {
-            effect.label: self.probability * share
-            for entry in self.selected_effects
-            for effect, share in zip(entry.equivalent_effects, entry.shares, strict=True)
-        }
 
     def explained_and_required_fractions(self, limits: Thresholds) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the explained and the required fraction of the gap, of fitted r'r and of held-out errors.
@@ -169,7 +154,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         added = (*added[:-1], replace(added[-1], refitted_model=replace(last, std=std)))
     said = Judgement("", "", fits, added, explained, carried, 0.0, ())
     reasons = _reasons_against(said, limits)
-    reason: _UnknownVerdictReason = next((name for name, holds in reasons.items() if holds), "")
+    reason = next((name for name, holds in reasons.items() if holds), "")
     # a gap that is seen only along a candidate's signature counts only with an accepted effect
     verdicts = {
         "insufficient_data": not evidence.are_data_sufficient,
@@ -185,7 +170,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     return replace(said, verdict=verdict, unknown_reason=told, probability=probability)
 
 
-def _reasons_against(said: Judgement, limits: Thresholds) -> dict[_UnknownVerdictReason, bool]:
+def _reasons_against(said: Judgement, limits: Thresholds) -> dict[str, bool]:
     """Whether each reason not to accept the selected effects holds; the first that does is told."""
     return {
         "none": not said.selected_effects,

@@ -207,13 +207,13 @@ def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
     """Check whether the residuals of a model exceed noise by a significant and relevant amount, in any of `tests`."""
-    significant = bonferroni_corrected_min_test_p_value(tests) < limits.significance_level
+    significant = bonferroni_corrected_min_p_value([test.p_value for test in tests]) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2_per_dof
 
 
-def bonferroni_corrected_min_test_p_value(tests: Sequence[NullTestResult]) -> float:
-    """Return the smallest p-value of several tests after Bonferroni correction."""
-    return min(1.0, len(tests) * min(test.p_value for test in tests))
+def bonferroni_corrected_min_p_value(p_values: Sequence[float]) -> float:
+    """Return the smallest p-value after Bonferroni correction, or 1 if there is none."""
+    return min([1.0, *(len(p_values) * p for p in p_values)])
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
-from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore, RefitStore, RefittedModel, StoredFit
+from yid_ocp.diagnosis.refit import RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import torque_law_tables_csv
@@ -97,7 +97,8 @@ def run_diagnose(
                 run.diagnosis.candidates,
                 thresholds=run.diagnosis,
                 progress=logged,
-                known_fits=NominalSolutionAndRefitStore(nominal, refits),
+                solution=nominal,
+                store=refits,
                 baseline=earlier,
                 exclude=run.diagnosis.excluded_candidates,
             )

@@ -276,13 +276,13 @@ def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
 
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
-    labels = finding.screening.confusability.labels
+    labels = finding.screening.labels
     names = [f"{entry['kind']}@{entry['location']}" for entry in result["which"][:_MAX_CANDIDATES]]
     names = [name for name in names if name in labels]
     if len(names) < 2:
         return None
     at = [labels.index(name) for name in names]
-    values = finding.screening.confusability.overlap_fractions[np.ix_(at, at)]
+    values = finding.screening.overlap_fractions[np.ix_(at, at)]
     pairs = ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2))
     said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
