@@ -231,8 +231,8 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
     tried = "no effect that was tried explains the error well enough"
-    apart = "".join(f". {text}" for texts in sizes.values() for text in texts[:2])
-    limit = f"less than {limits.min_z:g} ± from no effect, if ± includes the gap"
+    apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
+    limit = f"with the remaining error in its ±, it is less than {limits.min_z:g} ± from no effect"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
     more = f"Leave out diagnosis.candidates, if it is set, to try more than {', '.join(kinds)}."
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
@@ -241,7 +241,7 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     why, advice = {
         "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),
         "little": (f"adding {names} explains only {few}", ""),
-        "stand_in": (f"the size of {unsure} is uncertain ({limit}){apart}", again),
+        "stand_in": (f"the size of {unsure} is uncertain: {limit}{apart}", again),
     }.get(result.unknown_reason, ("", ""))
     return f"No cause is named, because {why}.", advice
 
