@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 from factories import (
     BIAS,
     FORCE,
@@ -22,6 +23,7 @@ from factories import (
     carried,
     closed,
     effect,
+    evaluation,
     finding,
     fit,
     loss,
@@ -251,6 +253,18 @@ def test_friction_is_to_be_fitted_law_by_law(monkeypatch):
     assert "yid-ocp friction" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
     monkeypatch.setattr(EffectBase, "is_joint_friction", True)
     assert "`yid-ocp friction CONFIG` fits the friction" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+
+
+def test_effects_that_only_a_prior_separates_from_the_nominal_model_share_one_advice():
+    rows = SimpleNamespace(data=slice(0, 2), stated_priors=slice(2, 3))
+    jacobian = evaluation([0.0] * 3, jacobian=np.array([[9.0, 9.0], [8.0, 8.0], [1.0, 0.0]]))
+    models = []
+    for own in (FRICTION, OFFSET):
+        names = ("k", f"{own.label}.a")
+        problem = SimpleNamespace(residual_rows=rows, unknown_names=names, shared_parameters=("k",))
+        models.append(replace(fit([own], problem=problem), evaluation=jacobian))
+    said = diagnosis_summary_text(with_effect(FRICTION, 0.5, single_effect_models=tuple(models)))
+    assert "separate friction@elbow from k; offset@wrist from k. To determine an effect, measure" in said
 
 
 def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_suffice():

@@ -247,8 +247,8 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
 
 
 def _bound_by_priors(result: DiagnosisResult) -> list[str]:
-    """One sentence per refitted effect whose amplitudes only the priors of nominal parameters determine."""
-    rows, remedy = [], "To determine the effect, measure these parameters and fix them (parameters.NAME.free: false)."
+    """A line on refitted effects whose amplitudes only the priors of nominal parameters determine, if there are any."""
+    pairs, remedy = [], "To determine an effect, measure these parameters and fix them (parameters.NAME.free: false)."
     for fit in result.single_effect_models:
         assert isinstance(fit, RefittedModel)
         if fit.evaluation.jacobian is None:
@@ -258,8 +258,8 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
         by = [mask_of_priors_determining_unknown(data, priors, names.index(n)) for n in own.amplitude_parameter_names]
         others = [*dict.fromkeys(names[i] for mask in by for i in np.flatnonzero(mask[:shared]))]
-        rows.append((others, f"These recordings cannot separate {own.label} from {listed(others)}. {remedy}"))
-    return _said(*rows)
+        pairs += _said((others, f"{own.label} from {listed(others)}"))
+    return _said((pairs, f"These recordings cannot separate {'; '.join(pairs)}. {remedy}"))
 
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
