@@ -84,6 +84,8 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 def test_no_such_configuration(cli, pendulum):
     folder = pendulum.parent
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
+    said = ("x.h5 is a recording, not a configuration", "yid-ocp init ROBOT.urdf")
+    assert_refused(cli("solve", folder / "x.h5"), *said)
     assert_refused(cli("check", folder), "this is a folder, but must be a file", "a YAML file")
     (folder / "list.yaml").write_text("- 1\n")
     assert_refused(cli("solve", folder / "list.yaml"), "but no keys")
@@ -156,7 +158,7 @@ def test_a_grasp_of_an_unknown_frame(cli, tmp_path, monkeypatch, repository):
     done = cli("solve", config, "--set", "model.object.mount.parent_frame=left_griper")
     assert_refused(done, "there is no frame 'left_griper'", "where: --set model.object.mount.parent_frame")
     frame = "model.frames={mark: {parent_frame: 'T:25%'}}"
-    assert_refused(cli("solve", config, "--set", frame), "no frame 'T:25%'", "did you mean 'T3:40%'?")
+    assert_refused(cli("solve", config, "--set", frame), "no frame 'T:25%'", "allowed: T3:40%")
     assert_refused(cli("solve", config, "--set", "model.object={kind: z}"), "there is no kind 'z'", "y, segments")
 
 

@@ -114,12 +114,12 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     wanted = [(axis, name) for name in point_names for axis in AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     mounted = _mounted_sensors(meanings, table, where)
-    is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
+    has_points_only = not joint_names and not mounted
 
     def measured(values: Sequence[Array]) -> IntArray:
-        """Indices of the rows in which not all `values` are NaN; of all rows if the table has no other group."""
+        """Indices of the rows in which not all `values` are NaN; of all rows if the table has points only."""
         flat = np.hstack([entry.reshape(len(table), -1) for entry in values])
-        return np.arange(len(t)) if is_alone else np.flatnonzero(~np.isnan(flat).all(axis=1))
+        return np.arange(len(t)) if has_points_only else np.flatnonzero(~np.isnan(flat).all(axis=1))
 
     joints, points, sensors = None, list[PointGroup](), list[SensorChannelGroup]()
     if joint_names:
@@ -368,10 +368,12 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             try:
                 numbers.append(_parsed_number(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                allowed = "a number, or an empty cell if there was no measurement"
+                allowed = (
+                    "a number; empty cells if all joints, the point or the sensor have no measurement at this time"
+                )
                 allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
                 what = f"the cell '{cell}' in column '{name}' is not a number"
-                hint = f"correct or empty the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
+                hint = f"correct the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
@@ -431,8 +433,10 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
-        hint = nearest_name_question(kind, known) or f"write for example --columns '{column}=position:JOINT'"
-        hint = f"write --columns '{column}={kind}:NAME'" if kind in known else hint
+        [meant], _ = column_meanings([given], _COMPONENTS)  # of `torque:elbow`, the effort of `elbow`
+        example = f"{kind}:NAME" if kind in known else ":".join(meant or ("position", "JOINT"))
+        hint = "" if meant or kind in known else nearest_name_question(kind, known)
+        hint = hint or f"write for example --columns '{column}={example}'"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
