@@ -259,6 +259,8 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     lost = {"shoulder.damping": (0.2, 0.1, "N m s/rad", "weak")}
     found = {name: (value, 0.01 * value, "SI", "identifiable") for name, value in values.items() if name not in lost}
     [line] = copied(system, values, **found, **lost)["mjcf"]
+    slide = prediction_outputs._mjcf_joint_line("rail", {"springref": 0.1}, ["elbow"])
+    assert ("radian" in line, "radian" in slide) == (True, False)
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')

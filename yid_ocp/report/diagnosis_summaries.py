@@ -521,7 +521,11 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
     yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
-    yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
+    if unknown := manifest["unknown"]:
+        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the"
+        yield SummaryStatement(f"{text} search ended. Do not rely on them.", "verdict")
+    found = {name: kinds[entry["status"]] + ", value unknown" * (name in unknown) for name, entry in entries}
+    yield SummaryTable([*rows, *((name, found[name], entry["how"]) for name, entry in entries)])
     if (gate := manifest["gate"]) is None:
         return
     if gate["status"] != "done":
@@ -538,5 +542,6 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
         more = "far above 1, errors of the recorded torques may also be the cause"
         yield f"{text} all channels. A ratio near 1 means that the file explains the recordings; {more}."
-    if gate["fall"] is not None:
-        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."
+    if (fall := gate["fall"]) is not None:
+        change = f"{100 * abs(fall):.3g} % {'more' if fall < 0 else 'less'}"
+        yield f"In MuJoCo, the error beyond noise on {held} is {change} than without estimates."

@@ -28,7 +28,14 @@ from yid_ocp.export.signals import (
     export_recording_csv_files,
     ros_signals_from_recording,
 )
-from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
+from yid_ocp.files import (
+    attributes_to_dict,
+    check_output_path,
+    file_sha256,
+    to_json_types,
+    write_strict_json,
+    write_text,
+)
 from yid_ocp.model.system import System
 from yid_ocp.report.diagnosis_summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
@@ -62,8 +69,12 @@ _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bia
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
+    ending = Path(out).suffix[1:].lower()
+    if ending in ("csv", _MCAP):
+        what, folder = f"{out} would be a folder of {ending} files", Path(out).with_suffix("")
+        hint = f"write --format {ending} --out {folder}"
+        raise ConfigError(what, where="--out", allowed="a folder name without this ending", hint=hint)
     if source.is_dir() and form not in ("csv", _MCAP):
-        ending = Path(out).suffix[1:].lower()
         form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
@@ -107,6 +118,7 @@ class _CalibratedModel:
     nominal_settings: RunSettings
     parameter_values: Mapping[str, float]
     parameter_stds: Mapping[str, float | None]
+    unknown_parameters: Sequence[str]  # cannot be found from the recordings, or are in doubt
 
     def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
         """Return the system with the effects `labels` (default: all); if `nominal`, only those of the nominal model."""
@@ -142,7 +154,9 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
     whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
-    return _CalibratedModel(whole, nominal, values, std)
+    verdicts = {name: entry.get("verdict", "") for name, entry in parameters.items()}
+    unknown = [name for name in std if std[name] is None or verdicts[name] in ("not_identifiable", "not_trusted")]
+    return _CalibratedModel(whole, nominal, values, std, unknown)
 
 
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
@@ -152,12 +166,13 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     """
     if form not in _MODEL_FORMATS:
         why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")
-        allowed, where = ", ".join(_MODEL_FORMATS), "--format, or the ending of --out"
+        allowed, where = ", ".join((*_MODEL_FORMATS, _MCAP)), "--format, or the ending of --out"
         what, hint = f"there is no format '{form}' of a model", f"write --format mjcf{why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if out.is_file():
         what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
         raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
+    check_output_path(out)
     calibrated = _read_calibrated_model(folder)
     progress.begin_stage("building the model")
     full = calibrated.system()
@@ -168,7 +183,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
             chosen[name] = replace(said, initial=calibrated.parameter_values[name])
         write_text(out, config_yaml_with_defaults(replace(calibrated.settings, parameters=chosen)))
         head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
-        return head | {"effects": {}, "parameters": {}, "gate": None}
+        return head | {"unknown": calibrated.unknown_parameters, "effects": {}, "parameters": {}, "gate": None}
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasps = {g.name: _grasp_support(form, supports.get(f"grasp_compliance@{g.name}")) for g in full.grasps}
@@ -186,6 +201,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "result": file_sha256(folder / "result.json"),
         "effects": {label: vars(entry) for label, entry in supports.items()},
         "parameters": parameters,
+        "unknown": calibrated.unknown_parameters,
         "grasps": {name: vars(entry) for name, entry in grasps.items()},
         "gate": None,
         "versions": software_and_plugin_versions(),
@@ -229,7 +245,7 @@ def _refuse_losses(
     if lost and not is_lossy:
         what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
         other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
-        hint = f"{other}add --lossy to leave them out; the manifest beside the file (.json) has the reason for each"
+        hint = f"{other}add --lossy to leave them out, with a manifest that has the reason for each"
         raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)
 
 
