@@ -117,7 +117,7 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
         (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg', but must be 'rad'", "convert")),
         (lambda j: setitem(j["position"], ..., np.rad2deg(j["position"][...]) + 90), ("degrees", "rad")),
         (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?")),
-        (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement",)),
+        (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement", "which has no efforts")),
         (lambda j: delitem(j.attrs, "effort_std"), ("deviation of the noise", "sensors.joints.effort.std")),
     ],
     ids=["nan", "backwards", "deg", "degrees unsaid", "another joint", "no effort", "no noise"],

@@ -388,28 +388,31 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
     joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
     worst, noise = max(entry["mean_error"] for entry in result["laws"].values()), "; noise alone: 1" * (unit == "std")
-    text = f"For {joints}, use the law '{best}'. Its held-out error is {error} (worst law: {worst:.3g}{noise}). It is "
-    text += f"the simplest law within one standard error of the best. Each motion was held out in turn: {kinds}."
+    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
+    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
+    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
+    text = f"For {joints}, use the law '{best}'. Its"
+    if is_absent := bool(friction) and all(shown[name] == "–" for name in friction):
+        text = f"Use no friction law for {joints}, because these recordings do not show friction. Of '{best}', the"
+    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law within one standard "
+    text += f"error of the best. Each motion was held out in turn: {kinds}."
     failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
     yield SummaryStatement(text + failed, "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
-    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
-    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
     constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
     for joint in result["joints"]:
         known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
         constants.append((joint, *(known.get(constant, "") for constant in heads)))
     yield SummaryTable(constants, f"Friction by the law '{best}'")
-    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
     said = f"These recordings do not determine the following parameters: {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
-    if not result["to_use"]:
+    if not result["to_use"] and not is_absent:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
     yield from copyable_estimates_blocks(result)
 
