@@ -117,7 +117,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     Raises `OutputError` if the folder is missing or the file cannot be written.
     """
-    check_output_path(path)
+    if path.is_dir() or not path.parent.is_dir():
+        what, allowed = "the folder to write to does not exist", "a file in an existing folder"
+        hint = f"create the folder by `mkdir -p {path.parent}`, or correct the path"
+        if path.is_dir():
+            what, allowed, hint = "this path is a folder", "the name of a file", f"use {path / 'NAME'}{path.suffix}"
+        raise OutputError(what, where=str(path), allowed=allowed, hint=hint)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary
@@ -130,16 +135,6 @@ def atomic_write(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def check_output_path(path: Path) -> None:
-    """Raise `OutputError` if `path` is a folder or its folder is missing. Long computations call this first."""
-    if path.is_dir() or not path.parent.is_dir():
-        what, allowed = "the folder to write to does not exist", "a file in an existing folder"
-        hint = f"create the folder by `mkdir -p {path.parent}`, or correct the path"
-        if path.is_dir():
-            what, allowed, hint = "this path is a folder", "the name of a file", f"use {path / 'NAME'}{path.suffix}"
-        raise OutputError(what, where=str(path), allowed=allowed, hint=hint)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -84,8 +84,7 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 def test_no_such_configuration(cli, pendulum):
     folder = pendulum.parent
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
-    said = ("x.h5 is a recording, not a configuration", "yid-ocp init ROBOT.urdf")
-    assert_refused(cli("solve", folder / "x.h5"), *said)
+    assert_refused(cli("solve", folder / "x.h5"), "x.h5 is a recording, not a configuration", "init ROBOT.urdf")
     assert_refused(cli("check", folder), "this is a folder, but must be a file", "a YAML file")
     (folder / "list.yaml").write_text("- 1\n")
     assert_refused(cli("solve", folder / "list.yaml"), "but no keys")

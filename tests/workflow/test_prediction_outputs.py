@@ -296,5 +296,4 @@ def test_a_frequency_that_follows_the_time_step_tells_of_a_start_that_is_too_sti
     [said] = _too_stiff_start_warnings(system, np.array([1.3e6, 2.0]), 0.005, [98.6], [378.0])
     assert said.endswith("Check size and unit of the initial values: beam.bend (1.3e+06 N m^2)")
     assert _too_stiff_start_warnings(system, np.array([1.3, 2.0]), 0.005, [4.0], [4.1]) == []
-    # of a vibration of 88 Hz, which steps of 12.5 ms show as one of 33 Hz
     assert _fine_time_step(0.05, 32.76) == pytest.approx(0.45 / (2 * np.pi * 88), rel=0.02)

@@ -70,10 +70,7 @@ def _example_robot_urdf(robot: str) -> Path:
         what = f"example-robot-data has {len(found)} robots '{robot}'"
         allowed = ", ".join(f"package:{n}" for n in found)
         raise ModelError(what, where=where, allowed=allowed, hint=f"choose one of them, such as package:{found[0]}")
-    what, stems = (
-        f"example-robot-data has no robot '{robot}'",
-        sorted({*short, *(path.stem for path in files.values())}),
-    )
+    what, stems = f"example-robot-data has no robot '{robot}'", sorted({*short, *(p.stem for p in files.values())})
     said = unknown_name_error_arguments(robot, stems, f"choose one of the robots, such as package:{stems[0]}")
     raise ModelError(what, where=where, **said)
 

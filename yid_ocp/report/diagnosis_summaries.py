@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, locations_by_effect_kind, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text, grouped, p_value_text, unseen_effects_sentence
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -83,7 +83,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
-    rows = [("effect", "places"), *((k, ", ".join(own)) for k, own in locations_by_effect_kind(unseen).items())]
+    rows = [
+        ("effect", "places"),
+        *((k, ", ".join(own)) for k, own in grouped(label.split("@") for label in unseen).items()),
+    ]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
@@ -246,11 +249,8 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    runs, found = result["runs"], dict[str, list[Mapping[str, Any]]]()
-    for entry in runs:
-        for name, own in entry["parameters"].items():
-            if own["value"] is not None:
-                found.setdefault(name, []).append(own)
+    runs = result["runs"]
+    found = grouped(own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
     names = sorted(found, key=lambda name: -len(found[name]))
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
@@ -323,11 +323,9 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
         best = f"All methods fit equally well, because their costs differ by {spread:.1g} at most."
     yield "" if result["disturbed"] else best
-    for name, message in (
-        (name, entry["message"]) for name, entry in methods.items() if entry["status"] != "converged"
-    ):
-        # the message names the key of `solve`
-        yield f"{name} did not converge: {message.replace('solver.', f'compare.methods.{name}.')}."
+    for name, entry in methods.items():
+        if entry["status"] != "converged":  # the message names the key of `solve`
+            yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
     yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
     steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
     yield next_steps_table(result, steps)

@@ -344,13 +344,12 @@ def _combination_blocks(texts: Sequence[str]) -> SummaryBlockOrTextIterator:
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
     done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
-    said = done if result["status"] == "done" else f"Do not use this motion: {message}."
+    said = f"{'Not finished' if is_usable else 'Do not use this motion'}: {message}."
+    said = done if result["status"] == "done" else said
     sought = result.get("parameters", {}).values()
     if is_hopeless := bool(sought) and all(own["verdict"] == "not_identifiable" for own in sought):
         said = "Do not use this motion, because none of the parameters can be found from it."
-    yield SummaryStatement(
-        said.replace("Do not use this motion:", "Not finished:") if is_usable else said, "conclusion"
-    )
+    yield SummaryStatement(said, "conclusion")
     parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity / limit", "largest effort / limit")]
@@ -418,11 +417,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
         yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (
-        f"This motion leaves open: {words.removesuffix('.')}."
-        for words in result["open"]
-        if not words.startswith(unseen)
-    )
+    yield from (f"This motion leaves open: {words}." for words in result["open"] if not words.startswith(unseen))
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 
@@ -501,8 +496,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     text = f"At the initial values and starts of motion, the recordings tell nothing of {abbreviated_names_text(lost)} "
     text += f"(± above {MAX_WEAK_RELATIVE_STD:g} times the value). `yid-ocp identifiability` tests this after a fit."
-    every = "Every free parameter changes a reading."
-    yield SummaryStatement(text if lost else every if changes else "", "verdict")
+    yield SummaryStatement(text if lost else "Every free parameter changes a reading." * bool(changes), "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
@@ -545,12 +539,7 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for name in dict.fromkeys(result["asked"] or shown):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        if seen is None or not rows:
-            sight = ""
-        elif len(seen) == len(rows):
-            sight = "all"
-        else:
-            sight = _row_names_text(seen) or "none"
+        sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else _row_names_text(seen) or "none"
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])

@@ -208,8 +208,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     for name, said in run.sensors.items():
         if name not in known:
             what, hint = f"no recording has the sensor '{name}'", f"leave sensors.{name} out, or correct the name"
-            details = unknown_name_error_arguments(name, sorted(known), hint)
-            raise run.config_error(what, "sensors", name, **details)
+            raise run.config_error(what, "sensors", name, **unknown_name_error_arguments(name, sorted(known), hint))
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_SENSOR_KEY:
             what, hint = f"'{name}' measures no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY} or remove it"
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"

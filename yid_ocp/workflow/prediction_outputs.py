@@ -132,10 +132,9 @@ def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> di
     return found
 
 
-def _mjcf_joint_line(joint: str, attributes: Mapping[str, float], revolute_joints: Sequence[str]) -> str:
+def _mjcf_joint_line(joint: str, attributes: Mapping[str, float], turning: Sequence[str]) -> str:
     shown = " ".join(f'{key}="{size:.4g}"' for key, size in attributes.items())
-    has_angle = joint in revolute_joints and attributes.get("springref")  # of zero, the unit has no effect
-    note = ' <!-- with compiler angle="radian" -->' if has_angle else ""
+    note = ' <!-- with compiler angle="radian" -->' if joint in turning and attributes.get("springref") else ""
     return f'<joint name="{joint}" {shown}/>{note}'
 
 

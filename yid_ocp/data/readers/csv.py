@@ -368,9 +368,7 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             try:
                 numbers.append(_parsed_number(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                allowed = (
-                    "a number; empty cells if all joints, the point or the sensor have no measurement at this time"
-                )
+                allowed = "a number; empty cells if no joint, or the whole point or sensor, was measured at this time"
                 allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
                 what = f"the cell '{cell}' in column '{name}' is not a number"
                 hint = f"correct the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
@@ -391,8 +389,7 @@ def _meanings(
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
             raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
-        for name, match in found.items():
-            given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
+        given |= {name: meaning.replace("*", own.group(1)) if "*" in key else meaning for name, own in found.items()}
     meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
     by_name, stated = column_meanings(header, _COMPONENTS)
     units: dict[str, str] = {}
@@ -433,10 +430,9 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
-        [meant], _ = column_meanings([given], _COMPONENTS)  # of `torque:elbow`, the effort of `elbow`
-        example = f"{kind}:NAME" if kind in known else ":".join(meant or ("position", "JOINT"))
-        hint = "" if meant or kind in known else nearest_name_question(kind, known)
-        hint = hint or f"write for example --columns '{column}={example}'"
+        meant = (kind, "NAME") if kind in known else column_meanings([given], _COMPONENTS)[0][0]  # `torque:elbow`
+        hint = "" if meant else nearest_name_question(kind, known)
+        hint = hint or f"write for example --columns '{column}={':'.join(meant or ('position', 'JOINT'))}'"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
@@ -450,6 +446,5 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column
             lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]
-            hint = nearest_name_question(meaning[1], lone) or hint
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(what, where=where, allowed=allowed, hint=nearest_name_question(meaning[1], lone) or hint)
     return table[:, [places[meaning] for meaning in wanted]]
