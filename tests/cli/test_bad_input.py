@@ -100,8 +100,7 @@ def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):
     same = pendulum_data.folder / "estimate.h5"
     assert_refused(cli("solve", pendulum, "--set", f"recordings.held_out=[{same}]"), "for estimation and as held out")
     missing = "recordings.estimate=[default:dual_arm_vison_estimate.h5]"
-    said = ("no such recording", "did you mean 'dual_arm_vision_estimate.h5'?")
-    assert_refused(cli("solve", pendulum, "--set", missing), *said)
+    assert_refused(cli("solve", pendulum, "--set", missing), "no such recording", "'dual_arm_vision_estimate.h5'?")
     left_nothing()
 
 
