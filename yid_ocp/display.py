@@ -6,7 +6,7 @@ import html
 import logging
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,17 +91,17 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
     return ", ".join(said) + (f" and {left} more" if left else "")
 
 
-def locations_by_effect_kind(labels: Sequence[str]) -> dict[str, list[str]]:
-    """Group labels `kind@location` of effects by their kind."""
-    found: dict[str, list[str]] = {}
-    for kind, _, location in (label.partition("@") for label in labels):
-        found.setdefault(kind, []).append(location)
+def grouped(pairs: Iterable[Sequence[Any]]) -> dict[Any, list[Any]]:
+    """Return the values of (key, value) pairs by key, in their order."""
+    found: dict[Any, list[Any]] = {}
+    for key, value in pairs:
+        found.setdefault(key, []).append(value)
     return found
 
 
 def unseen_effects_sentence(labels: Sequence[str]) -> str:
     """Sentence on effects that recordings would not show. Empty if there are none."""
-    known = locations_by_effect_kind(labels).items()
+    known = grouped(label.split("@") for label in labels).items()
     kinds = [f"{kind} ({len(own)} places)" if len(own) > 1 else f"{kind}@{own[0]}" for kind, own in known]
     return f"These recordings would not show these effects, even if they exist: {', '.join(kinds)}." if kinds else ""
 

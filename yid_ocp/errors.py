@@ -135,20 +135,20 @@ def require_known_names(
             raise kind(f"there is no {noun} '{name}'", where=where, **unknown_name_error_arguments(name, known))
 
 
-def _close(name: str, names: Sequence[str], count: int) -> list[str]:
+def _close(name: str, names: Sequence[str], count: int, cutoff: float) -> list[str]:
     plain = {entry.lower(): entry for entry in reversed(names)}
-    near = difflib.get_close_matches(name.lower(), plain, n=len(plain) + 1, cutoff=0.5)
+    near = difflib.get_close_matches(name.lower(), plain, n=len(plain) + 1, cutoff=cutoff)
     return [plain[n] for n in sorted(near, key=lambda n: sorted(n) != sorted(name.lower()))[:count]]
 
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:
     """Return the question "did you mean NAME?" for the most similar known name. Empty if no name is similar."""
-    close = _close(name, [*names], 1)
+    close = _close(name, [*names], 1, 0.6)
     return f"did you mean '{close[0]}'?" if close else ""
 
 
 def _listed(name: str, names: Sequence[str]) -> str:
-    close = _close(name, names, _N_NEAREST_NAMES)
+    close = _close(name, names, _N_NEAREST_NAMES, 0.5)
     if len(", ".join(names)) <= _MAX_LISTED_CHARACTERS or (not close and len(names) <= _MAX_LISTED_NAMES):
         return ", ".join(names)
     shown = [*close, *(entry for entry in names if entry not in close)][:_N_NEAREST_NAMES]

@@ -251,7 +251,7 @@ def test_check_refines_links_and_time_step(carried_out, written):
 
 
 def test_inspect(carried_out, pendulum, tmp_path):
-    entries = ("del[elbow], elbow.damping", "p1[shoulder]", "elbow.mass")
+    entries = ("del[elbow], elbow.damping", "p1[shoulder]", "elbow.mass", "elbow.damping")
     asked = [part for entry in entries for part in ("--entry", entry)]
     done = carried_out("inspect", pendulum, *asked, "--export", "eq")
     folder, result = done.folder, done.result
@@ -269,8 +269,8 @@ def test_inspect(carried_out, pendulum, tmp_path):
     [row] = [re.split(r"\s{2,}", line) for line in table.splitlines() if line.startswith("elbow.damping")]
     assert row[1:6] == ["N m s/rad", "2", "del[elbow], p1[elbow]", "all", "joints.effort"]
     assert float(row[-1]) == pytest.approx(damping["along"], rel=0.06)
-    # what is neither free nor asked for is in the result alone
-    assert ("shoulder.mass" in table, "elbow.mass" in table) == (False, True)
+    # what is not asked for is in the result alone
+    assert ("shoulder.stiffness" in table, "elbow.mass" in table) == (False, True)
     assert len(result["dependence"]["elbow.mass"]["rows"]) == 4
     assert result["dependence"]["elbow.mass"]["along"] is None
     assert any(line.startswith("del[elbow]: ") for line in (folder / "equations.txt").read_text().splitlines())
@@ -278,7 +278,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
         assert file["A"].shape == (4, 4)
         assert file["B_theta"].shape == (4, len(result["parameters"]))
     assert [entry["title"] for entry in result["entries"]] == ["d del[elbow] / d elbow.damping", "p1[shoulder]"]
-    assert result["asked"] == ["elbow.mass"]
+    assert result["asked"] == ["elbow.mass", "elbow.damping"]
     for entry in result["entries"]:
         for line in entry["lines"]:
             assert line in done.out

@@ -77,7 +77,7 @@ def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
     recording = read_any(path, column_meanings=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
-    path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
+    path = table(tmp_path, "t,q_a,q_b,x:m1,y:m1,z:m1,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
     recording = read_any(path, joints=["b=elbow"], point_names={"m2": "cable:100%"})
     assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
     assert (joints_of(recording).position[0, 0], recording.points[0].position[0, 0, 0]) == (2, 4)
@@ -93,8 +93,8 @@ def test_csv_clocks_of_joints_and_points(tmp_path: Path) -> None:
     assert np.array_equal(recording.points[0].t, [0, 1])
     assert np.isnan(recording.points[0].position[1]).all()
     # joints named after axes are no points
-    recording = read_any(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n"))
-    assert (recording.joint_names, recording.points) == (("T1_x", "T1_y", "T1_z"), ())
+    recording = read_any(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n1,,,\n"))
+    assert (recording.joint_names, recording.points, recording.duration) == (("T1_x", "T1_y", "T1_z"), (), 0)
 
 
 STAMPS = {
@@ -132,7 +132,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no measurements", ""),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
-    "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:JOINT"),
+    "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:a'"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),
     "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "numbers with commas and numbers with points", ""),
@@ -143,7 +143,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "misspelt": ("t,q_elbwo,q_b,effort_elbow,effort_b\n0,1,1,1,1\n", {}, "for position of 'elbow'", "mean 'elbwo'?"),
     "no position": ("t,effort_a\n0,1\n", {}, "no column for position of 'a'", ""),
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
-    "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "infinite value, the first of joint 'a' at t = 1 s", ""),
+    "empty cell of a joint": ("t,q_a,q_b\n0,1,1\n1,1,\n", {}, "infinite value, the first of joint 'b' at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
     "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg, others in rad", ""),
     "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),
@@ -320,7 +320,7 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     assert recording.points[0].position[0, 0] == pytest.approx([0.1, 0.2, 0.3])
     assert read_any(path, units={"points": "cm"}).points[0].position[0, 0] == pytest.approx([1, 2, 3])
     # a motor's current is no external effort
-    assert parse_quantity_units(["A", "ms"]) == {"effort": "A", "t": "ms"}
+    assert parse_quantity_units(["A", "ms", "points=CM"]) == {"effort": "A", "t": "ms", "points": "cm"}
     with pytest.raises(DataError, match="allowed: s, ms, us, ns, m, cm, mm, rad, deg, rev, rad/s"):
         parse_quantity_units(["degree"])
     # units in a row of their own, numbers of the rows, and a row that a spreadsheet left
@@ -391,8 +391,7 @@ def test_read_any_chooses_by_suffix(tmp_path: Path) -> None:
 
 def test_read_any_refuses_what_it_does_not_know(tmp_path: Path) -> None:
     error = refused(tmp_path / "run.csvv", r"no reader for '\.csvv'")
-    assert error.hint == "did you mean '.csv'?"
-    assert ".mcap" in error.allowed
+    assert (error.hint, ".mcap" in error.allowed) == ("did you mean '.csv'?", True)
     assert refused(table(tmp_path, "t,q_a\n0,1\n"), "no option 'unit'", unit={}).hint == "did you mean 'units'?"
 
 

@@ -170,6 +170,8 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
         assert f"± {100 * known.std_planned:.2g} %" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
     assert "holds for the configured initial values" in words
+    result["parameters"] = {name: own | {"verdict": "not_identifiable"} for name, own in result["parameters"].items()}
+    assert summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))[0].startswith("Do not use this ")
 
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):

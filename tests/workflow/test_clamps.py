@@ -149,7 +149,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
         ({"format": "yid-diagnosis/1"}, "table of CHANGELOG.md"),
         ({"status": "failed", "message": "no"}, "the run in this folder failed: no"),
         ({"covariance": {}}, "the key .names. is missing"),
-        ({"covariance": {"names": [], "matrix": []}}, "has no parameter with a standard deviation"),
+        ({"covariance": {"names": [], "matrix": []}}, "the run has found no parameter"),
     ],
 )
 def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, words):

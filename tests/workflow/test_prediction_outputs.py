@@ -26,7 +26,7 @@ from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table_rows
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.check import _input_noise, _too_stiff_start_warnings
+from yid_ocp.workflow.check import _fine_time_step, _input_noise, _too_stiff_start_warnings
 
 
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
@@ -259,6 +259,8 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     lost = {"shoulder.damping": (0.2, 0.1, "N m s/rad", "weak")}
     found = {name: (value, 0.01 * value, "SI", "identifiable") for name, value in values.items() if name not in lost}
     [line] = copied(system, values, **found, **lost)["mjcf"]
+    slide = prediction_outputs._mjcf_joint_line("rail", {"springref": 0.1}, ["elbow"])
+    assert ("radian" in line, "radian" in slide) == (True, False)
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
@@ -294,3 +296,4 @@ def test_a_frequency_that_follows_the_time_step_tells_of_a_start_that_is_too_sti
     [said] = _too_stiff_start_warnings(system, np.array([1.3e6, 2.0]), 0.005, [98.6], [378.0])
     assert said.endswith("Check size and unit of the initial values: beam.bend (1.3e+06 N m^2)")
     assert _too_stiff_start_warnings(system, np.array([1.3, 2.0]), 0.005, [4.0], [4.1]) == []
+    assert _fine_time_step(0.05, 32.76) == pytest.approx(0.45 / (2 * np.pi * 88), rel=0.02)

@@ -142,8 +142,7 @@ def predicted_refit_residual_at_finer_step(
     if isinstance(made, str) or coarse.has_process_noise:
         return None if isinstance(made, str) else made[1]
     _, left, before = made
-    is_alike = len(before.residual) == len(at_x.residual)
-    changed = before.residual - at_x.residual if is_alike else np.zeros(1)
+    changed = before.residual - at_x.residual if len(before.residual) == len(at_x.residual) else np.zeros(1)
     if not is_refitted and changed @ changed <= at_x.residual @ at_x.residual:
         return left
     start = refined._unknowns(coarse.unknown_names, x)
@@ -351,8 +350,7 @@ def parameter_shifts_at_finer_discretisation(
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
-            least = max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left))
-            if excess - rest > least:
+            if excess - rest > max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left)):
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
                 notes.append(f"{said}. First set {settings[key]}, and run `solve` again.")
     if kinds and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):

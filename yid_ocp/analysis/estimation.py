@@ -14,7 +14,7 @@ from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, grouped
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
@@ -87,7 +87,7 @@ def add_intervals_and_checks(
     solution = solution_with_profile_intervals(problem, solution, progress)
     data_std = solution.std
     solution, checks = add_discretisation_errors(problem, solution, progress)
-    progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
+    progress.begin_stage("predicting the held-out recordings" if problem.held_out else "checking the fit", 1.2, 1.5)
     held_out, expected = _predict_held_out_with_expected_errors(problem, solution.x)
     problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
@@ -345,11 +345,8 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
     """Return an issue for each sensor that the best baseline predicts better than the model, over all its channels."""
     found = []
     for entry in entries:
-        groups: dict[str, list[str]] = {}
-        for channel in entry["rmse"]:
-            if channel in units:  # not the sum over a group
-                groups.setdefault(channel.rpartition(".")[0], []).append(channel)
-        for group, channels in groups.items():
+        single = (channel for channel in entry["rmse"] if channel in units)  # not the sum over a group
+        for group, channels in grouped((channel.rpartition(".")[0], channel) for channel in single).items():
             rms = {
                 name: float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
                 for name, errors in {"": entry["rmse"], **entry["baselines"]}.items()

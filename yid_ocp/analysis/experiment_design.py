@@ -206,8 +206,7 @@ class VariantPositionSensitivities:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
             node, fraction = grid.preceding_node_and_fraction(grid.start_time + view.times[inside])
             slopes = self.position_sensitivities[episode, view.point_group, view.frame]
-            after = slopes[np.minimum(node + 1, grid.steps)]
-            rows = slopes[node] + fraction[:, None, None] * (after - slopes[node])
+            rows = slopes[node] + fraction[:, None, None] * (slopes[np.minimum(node + 1, grid.steps)] - slopes[node])
             rows = (rows / view.std[inside][:, :, None]).reshape(-1, rows.shape[2])
             self._known[key] = rows.T @ rows
         return self._known[key]

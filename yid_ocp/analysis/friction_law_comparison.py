@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import PartsDoneCounter
+from yid_ocp.display import PartsDoneCounter, grouped
 from yid_ocp.effects.law import torque_law_quantity_at_midpoints
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
@@ -47,9 +47,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
-    found: dict[str, list[str]] = {}
-    for name in names:
-        found.setdefault(re.sub(r"[_-]?\d+$", "", name), []).append(name)
+    found = grouped((re.sub(r"[_-]?\d+$", "", name), name) for name in names)
     if len(found) < _MIN_MOTION_KINDS:
         return {name: (name,) for name in names}
     return {kind: tuple(own) for kind, own in found.items()}

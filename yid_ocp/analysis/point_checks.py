@@ -314,9 +314,7 @@ def cable_point_geometry_issues(cable: CableVertices, recording: Recording, grav
             words, depth = f"{words} ({low:g} to {high:g} times is tolerated)", max(typical / high, low / typical)
             advice = f"divide the positions in the file by {typical:.3g}"
             found[0] = Issue("point_scale", words, "not_trusted", depth, advice, "")
-        for issue in found:
-            if issue is not None:
-                yield replace(issue, recording=recording.name, group=group.name)
+        yield from (replace(own, recording=recording.name, group=group.name) for own in found if own is not None)
 
 
 def _lengths(where: Mapping[str, Array], edges: Sequence[tuple[str, str]]) -> Array:

@@ -62,6 +62,11 @@ def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> li
 
 
 def _read(path: Path) -> str:
+    files = {".urdf": f"{path} RECORDING.h5", ".xml": f"{path} RECORDING.h5", ".h5": f"ROBOT.urdf {path}"}
+    if path.suffix in files:  # arguments of `init`
+        what = f"{path.name} is a {'recording' if path.suffix == '.h5' else 'robot'}, not a configuration"
+        hint = f"write a configuration: yid-ocp init {files[path.suffix]} --out CONFIG.yaml"
+        raise ConfigError(what, where=str(path), allowed="a YAML file", hint=hint)
     try:
         return read_input_text(path, _MAX_BYTES)
     except DataError as error:

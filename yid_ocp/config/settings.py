@@ -457,7 +457,9 @@ class RunSettings:
         if option == "--set" and not (f"{key}.".startswith(f"{told}.") or told.startswith(f"{key}.")):
             option, place = "", self.config_file
         rest = f"{key}.".removeprefix(f"{told}.").strip(".0123456789") if option == "--set" else key  # of a list: none
-        return place if option == "--baseline" else ": ".join(filter(None, (place, rest)))
+        below = {own for at, own in self.key_locations.items() if at[: len(path)] == path and own.startswith("--set ")}
+        said = place if option == "--baseline" else ": ".join(filter(None, (place, rest)))
+        return ", ".join((said, *sorted(below - {place})))
 
     def config_error(self, what: str, *path: str | int, hint: str, allowed: str = "") -> ConfigError:
         """Make a `ConfigError` that states the file, line and key of a setting. The caller raises it."""

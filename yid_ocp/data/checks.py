@@ -139,7 +139,7 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
                 what += f". If the times are in {unit}, the rate is {1 / (step * size):.4g} Hz"
-                advice = f"if the times are in {unit}, divide them by {1 / size:g}"
+                advice = f"if so, import again with --units t={unit}, or divide them by {1 / size:g}"
                 break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 

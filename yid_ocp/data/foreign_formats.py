@@ -77,6 +77,9 @@ def _exact_meaning(column: str, sensor_components: Sequence[str]) -> ColumnMeani
         if column.startswith(prefix) and column != prefix:
             found = _EXACT_PREFIXES[prefix], column.removeprefix(prefix)
             return None if _NUMBERED_COMMAND.fullmatch(column) else found
+    kind, _, name = column.partition(":")
+    if name and kind in (*JOINT_CHANNEL_UNITS, *AXES, *sensor_components):
+        return kind, name
     for component in sorted(sensor_components, key=len, reverse=True):
         if (name := column.removesuffix(f"_{component}")) not in ("", column):
             return component, name

@@ -24,8 +24,7 @@ _MIN_LIMIT_CURRENT = 0.1  # smallest current limit of the search [A]
 
 
 def _recorded_joints(system: System) -> tuple[str, ...]:
-    known = {*system.driven, *system.prescribed}
-    return tuple(name for name in base.arm_joint_names(system) if name in known)
+    return tuple(name for name in base.arm_joint_names(system) if name in (*system.driven, *system.prescribed))
 
 
 def _effort_joints(system: System) -> tuple[str, ...]:

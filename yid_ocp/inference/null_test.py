@@ -16,6 +16,7 @@ import scipy.linalg
 import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.display import grouped
 from yid_ocp.inference import whitening
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -281,8 +282,7 @@ def held_out_loss(
     whole, number = np.concatenate(residuals), np.concatenate(numbered)
 
     def whitened(beside: Array) -> Array:
-        made = whiten_with_extra_errors(whole, beside)
-        return np.nan_to_num(made, nan=np.inf, posinf=np.inf, neginf=np.inf)
+        return np.nan_to_num(whiten_with_extra_errors(whole, beside), nan=np.inf, posinf=np.inf, neginf=np.inf)
 
     updated = float(np.sum(whitened(np.vstack(errors)) ** 2))
     if spread is not None:  # what the nominal parameters leave uncertain is no gap
@@ -351,9 +351,7 @@ def _windows(
     series: Sequence[OutputResidualIndices], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw, p_values = list[tuple[str, str, float, float]](), list[float]()
-    merged: dict[tuple[str, str], list[OutputResidualIndices]] = {}
-    for s in series:
-        merged.setdefault((s.recording, s.channel), []).append(s)
+    merged = grouped(((s.recording, s.channel), s) for s in series)
     for (recording, channel), own in merged.items():
         last = max(float(s.t[-1]) for s in own)
         for k in range(int(last / length) + 1):

@@ -27,6 +27,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.display import grouped
 from yid_ocp.inference.kalman import KalmanStepMatrices, StateTransition, kalman_covariance_step
 from yid_ocp.inference.smoother_model import (
     ResidualStateSpaceModel,
@@ -99,8 +100,7 @@ class SmoothedUnknownsResult:
         """The origin of the gap: "none", "plant", "sensor", "both", or "either" if the data cannot distinguish them."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
-        heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
-        if heaviest.is_confounded_with_bias:
+        if max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source]).is_confounded_with_bias:
             return "either"
         # both must exceed either alone by more than chance
         alone = max(("plant", "sensor"), key=lambda name: self.log_evidence[name])
@@ -504,9 +504,7 @@ def gap_locations_by_smoother_evidence(smoothed: SmoothedUnknownsResult) -> tupl
 
     In the time windows of a location, one of its unknowns is more than three standard deviations from zero.
     """
-    groups: dict[str, list[SmoothedUnknownGroup]] = {}
-    for source in smoothed.log_evidence_drop:
-        groups.setdefault(source.location, []).append(source)
+    groups = grouped((source.location, source) for source in smoothed.log_evidence_drop)
     drop = smoothed.log_evidence_drop
     weight = {location: sum(drop[s] for s in own) for location, own in groups.items()}
     total, found = sum(weight.values()), []

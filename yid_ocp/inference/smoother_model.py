@@ -23,6 +23,7 @@ import scipy.linalg
 import scipy.sparse
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.display import grouped
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
@@ -139,9 +140,7 @@ def _unknown_forces(course: _LinearizedEpisode) -> tuple[list[str], list[Smoothe
     names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
     forced = np.array([joint_names.index(name) for name in names], int)
     load = _loads(course)
-    of_place: dict[str, list[float]] = {}
-    for name, index in zip(names, forced, strict=True):
-        of_place.setdefault(place[name], []).append(load[index])
+    of_place = grouped((place[name], load[index]) for name, index in zip(names, forced, strict=True))
     largest = max((max(v) for v in of_place.values()), default=1.0)
     rms = {p: max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
     sources = [SmoothedUnknownGroup(place[name], "force", name in measured) for name in names]

@@ -495,7 +495,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
     if explains:
         return f"The model explains the recordings to within their noise ({size})."
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    return f"{said} To find the cause, run `yid-ocp diagnose`."
+    return f"{said} To find the cause, check the stated noise and run `yid-ocp diagnose`."
 
 
 def value_and_uncertainty_text(

@@ -259,8 +259,7 @@ def _kernel_tables(functions: StepFunctions, tables: StepSparsityTables) -> list
     lines: list[str] = []
 
     def table(name: str, values: Sequence[int] | NDArray[np.integer]) -> None:
-        entries = ", ".join(str(int(v)) for v in values) or "0"
-        lines.append(f"static const int {name}[] = {{{entries}}};")
+        lines.append(f"static const int {name}[] = {{{', '.join(str(int(v)) for v in values) or '0'}}};")
 
     def ragged(name: str, suffix: str, lists: Sequence[Sequence[int] | _Indices], width: int = 1) -> None:
         table(f"{name}_start", np.concatenate([[0], np.cumsum([len(entries) // width for entries in lists])]))

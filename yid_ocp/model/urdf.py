@@ -59,7 +59,8 @@ def _example_robot_urdf(robot: str) -> Path:
         what, hint = "the package example-robot-data is not installed", "pip install example-robot-data"
         raise ModelError(what, where=f"package:{robot}", allowed="package:NAME if it is installed", hint=hint)
     files, stem = _urdf_files(folder), robot.lower().removesuffix(".urdf")
-    stem = {"ur5": "ur5_robot", "ur10": "ur10_robot"}.get(stem, stem)
+    short = {"ur5": "ur5_robot", "ur10": "ur10_robot"}
+    stem = short.get(stem, stem)
     found = [robot] if robot in files else [name for name, path in files.items() if path.stem.lower() == stem]
     found = [name for name in found if name == f"{stem}_description/urdf/{stem}.urdf"] or found
     if len(found) == 1:
@@ -69,7 +70,7 @@ def _example_robot_urdf(robot: str) -> Path:
         what = f"example-robot-data has {len(found)} robots '{robot}'"
         allowed = ", ".join(f"package:{n}" for n in found)
         raise ModelError(what, where=where, allowed=allowed, hint=f"choose one of them, such as package:{found[0]}")
-    what, stems = f"example-robot-data has no robot '{robot}'", sorted({path.stem for path in files.values()})
+    what, stems = f"example-robot-data has no robot '{robot}'", sorted({*short, *(p.stem for p in files.values())})
     said = unknown_name_error_arguments(robot, stems, f"choose one of the robots, such as package:{stems[0]}")
     raise ModelError(what, where=where, **said)
 

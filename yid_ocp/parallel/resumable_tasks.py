@@ -337,7 +337,7 @@ def _dask_executor(
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"
         allowed = "HOST:PORT of a running `dask scheduler`, or the path of its scheduler file"
-        hint = "start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`"
+        hint = "state the port, or start `dask scheduler` and `dask worker HOST:PORT --nthreads 1`"
         refusal = ParallelWorkError(what, where=scheduler, allowed=allowed, hint=hint)
     if refusal is not None:
         gc.collect()  # a half-built client that is finalized while another one starts makes both wait for ever

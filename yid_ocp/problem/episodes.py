@@ -347,7 +347,8 @@ def _samples(
     samples = tuple(measurements_located_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"
-        hint = "set use: true for a group under `sensors`, or frame_by_recorded_name: {POINT: FRAME} for its points"
+        what += ", which has no efforts" * (recording.joints is not None and recording.joints.effort is None)
+        hint = "record efforts or points; if the file has some, set use: true or frame_by_recorded_name under `sensors`"
         raise DataError(what, where=where, allowed="points on the model's frames, or channels of its joints", hint=hint)
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 

@@ -12,6 +12,7 @@ import scipy.special
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period, noise_or_quantization_std
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.display import grouped
 from yid_ocp.effects import EFFECTS, signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError
 from yid_ocp.model.objects.base import ClampPosePointNames
@@ -250,11 +251,9 @@ def recorded_signal_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
 
 def effect_kinds_by_missing_signals(recordings: Sequence[Recording]) -> dict[str, list[str]]:
     """Map missing signals, such as 'camera and joints.effort', to the kinds of effects that cannot be candidates."""
-    present, found = recorded_signal_kinds(recordings), dict[str, list[str]]()
-    for kind in EFFECTS:
-        if missing := sorted(EFFECTS[kind].required_sensors - present):
-            found.setdefault(" and ".join(missing), []).append(kind)
-    return found
+    present = recorded_signal_kinds(recordings)
+    missing = ((" and ".join(sorted(EFFECTS[kind].required_sensors - present)), kind) for kind in EFFECTS)
+    return grouped(pair for pair in missing if pair[0])
 
 
 def prescribed_coordinates_at_nodes(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, locations_by_effect_kind, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text, grouped, p_value_text, unseen_effects_sentence
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -83,7 +83,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
-    rows = [("effect", "places"), *((k, ", ".join(own)) for k, own in locations_by_effect_kind(unseen).items())]
+    rows = [
+        ("effect", "places"),
+        *((k, ", ".join(own)) for k, own in grouped(label.split("@") for label in unseen).items()),
+    ]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
@@ -246,11 +249,8 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    runs, found = result["runs"], dict[str, list[Mapping[str, Any]]]()
-    for entry in runs:
-        for name, own in entry["parameters"].items():
-            if own["value"] is not None:
-                found.setdefault(name, []).append(own)
+    runs = result["runs"]
+    found = grouped(own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
     names = sorted(found, key=lambda name: -len(found[name]))
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
@@ -323,11 +323,9 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
         best = f"All methods fit equally well, because their costs differ by {spread:.1g} at most."
     yield "" if result["disturbed"] else best
-    for name, message in (
-        (name, entry["message"]) for name, entry in methods.items() if entry["status"] != "converged"
-    ):
-        # the message names the key of `solve`
-        yield f"{name} did not converge: {message.replace('solver.', f'compare.methods.{name}.')}."
+    for name, entry in methods.items():
+        if entry["status"] != "converged":  # the message names the key of `solve`
+            yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
     yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
     steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
     yield next_steps_table(result, steps)
@@ -388,28 +386,31 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
     joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
     worst, noise = max(entry["mean_error"] for entry in result["laws"].values()), "; noise alone: 1" * (unit == "std")
-    text = f"For {joints}, use the law '{best}'. Its held-out error is {error} (worst law: {worst:.3g}{noise}). It is "
-    text += f"the simplest law within one standard error of the best. Each motion was held out in turn: {kinds}."
+    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
+    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
+    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
+    text = f"For {joints}, use the law '{best}'. Its"
+    if is_absent := bool(friction) and all(shown[name] == "–" for name in friction):
+        text = f"Use no friction law for {joints}, because these recordings do not show friction. Of '{best}', the"
+    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law within one standard "
+    text += f"error of the best. Each motion was held out in turn: {kinds}."
     failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
     yield SummaryStatement(text + failed, "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
-    told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
-    shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
     constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
     for joint in result["joints"]:
         known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
         constants.append((joint, *(known.get(constant, "") for constant in heads)))
     yield SummaryTable(constants, f"Friction by the law '{best}'")
-    lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
     said = f"These recordings do not determine the following parameters: {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
-    if not result["to_use"]:
+    if not result["to_use"] and not is_absent:
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
     yield from copyable_estimates_blocks(result)
 
@@ -521,7 +522,11 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
     yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
-    yield SummaryTable([*rows, *((name, kinds[entry["status"]], entry["how"]) for name, entry in entries)])
+    if unknown := manifest["unknown"]:
+        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the"
+        yield SummaryStatement(f"{text} search ended. Do not rely on them.", "verdict")
+    found = {name: kinds[entry["status"]] + ", value unknown" * (name in unknown) for name, entry in entries}
+    yield SummaryTable([*rows, *((name, found[name], entry["how"]) for name, entry in entries)])
     if (gate := manifest["gate"]) is None:
         return
     if gate["status"] != "done":
@@ -538,5 +543,6 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
         more = "far above 1, errors of the recorded torques may also be the cause"
         yield f"{text} all channels. A ratio near 1 means that the file explains the recordings; {more}."
-    if gate["fall"] is not None:
-        yield f"In MuJoCo, the error beyond noise on {held} is {100 * gate['fall']:.3g} % less than without estimates."
+    if (fall := gate["fall"]) is not None:
+        change = f"{100 * abs(fall):.3g} % {'more' if fall < 0 else 'less'}"
+        yield f"In MuJoCo, the error beyond noise on {held} is {change} than without estimates."

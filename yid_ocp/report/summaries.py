@@ -316,7 +316,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         if asked and asked["smallest"]:
             again = f"estimate from FILE, a recording with {asked['smallest'][0]['words']}"
             steps[again] = "solve --set 'recordings.estimate=[FILE]'"
-        else:
+        elif not any("springs in series" in words for words in hidden):  # of these, more markers are needed
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         steps["fix a parameter whose VALUE is known"] = f"solve --set {name}.free=false --set {name}.initial=VALUE"
         steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
@@ -344,8 +344,12 @@ def _combination_blocks(texts: Sequence[str]) -> SummaryBlockOrTextIterator:
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
     done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
-    said = done if result["status"] == "done" else f"Do not use this motion: {message}."
-    yield SummaryStatement(said.replace("Do not use this motion", "Not finished") if is_usable else said, "conclusion")
+    said = f"{'Not finished' if is_usable else 'Do not use this motion'}: {message}."
+    said = done if result["status"] == "done" else said
+    sought = result.get("parameters", {}).values()
+    if is_hopeless := bool(sought) and all(own["verdict"] == "not_identifiable" for own in sought):
+        said = "Do not use this motion, because none of the parameters can be found from it."
+    yield SummaryStatement(said, "conclusion")
     parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity / limit", "largest effort / limit")]
@@ -356,7 +360,9 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
     steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
-    record = {"estimate from FILE, a recording of this motion": "solve --set recordings.estimate=[FILE]"}
+    record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
+    if is_hopeless:
+        record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = ({} if result["from"]["run"] else steps) | (record if result["goal"] == "information" else {})
     yield next_steps_table(result, longer if not is_usable and said != done else steps)
 
@@ -411,7 +417,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         names = ", ".join(name for name, own in result["unseen"].items() if own == words)
         yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (f"This motion leaves open: {words}" for words in result["open"] if not words.startswith(unseen))
+    yield from (f"This motion leaves open: {words}." for words in result["open"] if not words.startswith(unseen))
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 
@@ -427,6 +433,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
     elif is_advised:
         ended = f"`solve` can run, but its estimates may be poor: read the {'issues' if mild else 'warnings'} below."
+    ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."
@@ -489,8 +496,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
     text = f"At the initial values and starts of motion, the recordings tell nothing of {abbreviated_names_text(lost)} "
     text += f"(± above {MAX_WEAK_RELATIVE_STD:g} times the value). `yid-ocp identifiability` tests this after a fit."
-    every = "Every free parameter changes a reading."
-    yield SummaryStatement(text if lost else every if changes else "", "verdict")
+    yield SummaryStatement(text if lost else "Every free parameter changes a reading." * bool(changes), "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
@@ -503,11 +509,12 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std).{begun}"
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"{left} more free parameters are in result.json." if left > 0 else ""
+    yield f"{left} more free parameters are in result.json." if left > 0 and not result["asked"] else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
         yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
-    for name, entry in result["parameters"].items():
+    for name in result["asked"] or result["parameters"]:
+        entry = result["parameters"][name]
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
@@ -524,20 +531,15 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield the rows that contain each free or named parameter, and the change of readings by one unit of it."""
+    """Yield the equations with each named (else each free) parameter, and the change of readings by one unit of it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
     head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
     yield *head, "change of one reading [std]", "change of all readings [std]"
-    for name in dict.fromkeys([*shown, *result["asked"]]):
+    for name in dict.fromkeys(result["asked"] or shown):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        if seen is None or not rows:
-            sight = ""
-        elif len(seen) == len(rows):
-            sight = "all"
-        else:
-            sight = _row_names_text(seen) or "none"
+        sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else _row_names_text(seen) or "none"
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])

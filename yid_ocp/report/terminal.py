@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
-from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
 
@@ -113,12 +113,9 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
-    for cause in dict.fromkeys(entry["cause"] for entry in issues):
-        alike, words = [entry for entry in issues if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
-        by_remedy: dict[str, list[Mapping[str, Any]]] = {}
-        for entry in alike:
-            by_remedy.setdefault("setting" if entry["setting"] else entry["advice"], []).append(entry)
-        parts = list(by_remedy.values())
+    for cause, alike in grouped((entry["cause"], entry) for entry in issues).items():
+        words = ISSUE_CAUSE_DESCRIPTIONS[cause]
+        parts = [*grouped(("setting" if own["setting"] else own["advice"], own) for own in alike).values()]
         last = [entry for part in parts[_MAX_REMEDIES_PER_CAUSE - 1 :] for entry in part]
         for first, *others in filter(None, [*parts[: _MAX_REMEDIES_PER_CAUSE - 1], last]):
             where, do = first["where"] + f" and {len(others)} more" * bool(others), first["advice"]

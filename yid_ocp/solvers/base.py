@@ -386,8 +386,7 @@ class _MultiStartSearch:
         def watched(entry: Iterate) -> None:
             noted(entry)
             distance = linearized_residual.step_norm_in_stds(best.evaluation, entry.x - best.result.x)
-            gain = best.evaluation.cost - entry.cost
-            if distance < _SAME_MINIMUM_STDS and -(distance**2) - least < gain < least:
+            if distance < _SAME_MINIMUM_STDS and -(distance**2) - least < best.evaluation.cost - entry.cost < least:
                 reached.append(True)
                 raise StopSearch
 

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import shortest_path
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import grouped
 from yid_ocp.errors import DataError
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions, CameraClockOptions
@@ -201,9 +202,7 @@ def times_configurations_points_of_good_frames(
 def _none_good(
     frames: Sequence[FrameReport], sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], source: str
 ) -> DataError:
-    kinds: dict[str, list[str]] = {}
-    for frame in frames:
-        kinds.setdefault(frame.drop_reason.partition(":")[0], []).append(frame.drop_reason)
+    kinds = grouped((frame.drop_reason.partition(":")[0], frame.drop_reason) for frame in frames)
     often = sorted(kinds.values(), key=len, reverse=True)[:2]
     said = [own[0].replace(": ", ", for example: ", 1) if len(set(own)) > 1 else own[0] for own in often]
     cause = _because(sizes, next((reasons[0] for reasons in often), "").startswith(_MISFIT_REASONS))

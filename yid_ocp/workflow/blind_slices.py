@@ -141,6 +141,9 @@ def rescore_blind(
     effects change, `not_judged` counts the cases that need a refit that the original diagnosis did not make.
     """
     made, target = Path(folder), make_folder(out)
+    if not (made / "commitment.json").is_file():
+        what, allowed = f"{made} has no cases of a blind test", "a folder with commitment.json"
+        raise DataError(what, where="--rescore", allowed=allowed, hint="give the folder that `yid-ocp blind` printed")
     commitment = read_input_json(made / "commitment.json")
     opened = blind.read_labels_checking_sha256(read_input_text(made / "sealed/labels.json"), commitment["sha256"])
     labels = {label.case: label for label in opened}

@@ -207,8 +207,8 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     known = {key for recording in recordings for key in recording.sensor_setting_keys}
     for name, said in run.sensors.items():
         if name not in known:
-            what, details = f"no recording has the sensor '{name}'", unknown_name_error_arguments(name, sorted(known))
-            raise run.config_error(what, "sensors", name, **details)
+            what, hint = f"no recording has the sensor '{name}'", f"leave sensors.{name} out, or correct the name"
+            raise run.config_error(what, "sensors", name, **unknown_name_error_arguments(name, sorted(known), hint))
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_SENSOR_KEY:
             what, hint = f"'{name}' measures no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY} or remove it"
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"

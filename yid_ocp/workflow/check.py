@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -67,8 +68,10 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
+        is_refused = run.recordings.stop_on_any_issue and bool(warnings or convergence["warnings"])
         result = {
             "format": "yid-check/1",
+            "refused": is_refused,
             "model": {"name": step.system.mechanism.name, **step.sizes},
             "mechanics": mechanics,
             "recordings": recordings,
@@ -77,7 +80,6 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    is_refused = run.recordings.stop_on_any_issue and bool(warnings or convergence["warnings"])
     return CommandOutcome(folder.path, written, None, not is_refused)
 
 
@@ -216,7 +218,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     warnings += _too_stiff_start_warnings(system, theta, h, *(row["hertz"][:1] for row in (steps[0], steps[-1])))
-    _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", f"problem.time_step: {h / 2:g}", steps)
+    step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g}"
+    _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
         other = build_system(run, link_division=2)
@@ -240,6 +243,11 @@ def _too_stiff_start_warnings(
     said = f"the lowest natural frequency only follows the time step ({stated[0]:.3g} Hz with {h:g} s, {finest[0]:.3g} "
     said += f"Hz with {h / 4:g} s), so with the initial parameters the model is too stiff to be identified. Check size "
     return [f"{said}and unit of the initial values: {abbreviated_names_text(stiff)}"]
+
+
+def _fine_time_step(h: float, hertz: float) -> float:
+    """Return a step [s] with 2 % error of a vibration with `hertz` at the step `h` / 4, by the midpoint rule's atan."""
+    return 0.45 / max(8 / h * math.tan(math.pi / 4 * min(hertz * h, 1.9)), 0.9 / h)
 
 
 def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:

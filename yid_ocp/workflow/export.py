@@ -62,16 +62,16 @@ _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bia
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
-    if source.is_dir() and form not in ("csv", _MCAP):
-        ending = Path(out).suffix[1:].lower()
+    ending = Path(out).suffix[1:].lower()
+    if ending in ("csv", _MCAP):
+        what, hint = f"{out} would be a folder of {ending} files", f"write --out {Path(out).with_suffix('')}"
+        raise ConfigError(what, where="--out", allowed="a folder name without this ending", hint=hint)
+    if source.is_dir() and form != _MCAP:
         form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
         print_result(arguments, manifest, lambda: summary_terminal_lines(summarize_export(manifest)), out, out)
         return EXIT_DONE
-    if source.is_dir() and form == "csv":
-        allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording (.h5), or write --format mcap"
-        raise ConfigError("a run folder cannot be written as CSV", where="--format csv", allowed=allowed, hint=hint)
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
@@ -106,7 +106,7 @@ class _CalibratedModel:
     settings: RunSettings
     nominal_settings: RunSettings
     parameter_values: Mapping[str, float]
-    parameter_stds: Mapping[str, float | None]
+    parameter_stds: Mapping[str, float | None]  # None for an estimate that cannot be found or is in doubt
 
     def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
         """Return the system with the effects `labels` (default: all); if `nominal`, only those of the nominal model."""
@@ -140,7 +140,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         what = "the result has no valid parameter values: another version wrote it, or it is damaged"
         raise DataError(what, where=where, allowed=allowed, hint=f"repeat {result.get('command', 'it')}") from error
     nominal = load_config(folder / "config.yaml")
-    std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
+    doubtful = [n for n, own in parameters.items() if own.get("verdict") in ("not_identifiable", "not_trusted")]
+    std = {n: None if n in doubtful else own.get("std") for n, own in parameters.items() if own.get("free")}
     whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
     return _CalibratedModel(whole, nominal, values, std)
 
@@ -152,15 +153,15 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     """
     if form not in _MODEL_FORMATS:
         why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")
-        allowed, where = ", ".join(_MODEL_FORMATS), "--format, or the ending of --out"
-        what, hint = f"there is no format '{form}' of a model", f"write --format mjcf{why}"
+        allowed, where = ", ".join((*_MODEL_FORMATS, _MCAP)), "--format, or the ending of --out"
+        what, hint = f"a run folder has no format '{form}'", f"write --format mjcf or mcap{why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if out.is_file():
         what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
         raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
     calibrated = _read_calibrated_model(folder)
     progress.begin_stage("building the model")
-    full = calibrated.system()
+    full, unknown = calibrated.system(), [n for n, std in calibrated.parameter_stds.items() if std is None]
     if form == "yaml":
         chosen = settings_by_parameter_name(calibrated.settings, full.parameters)
         for name in calibrated.parameter_stds:
@@ -168,7 +169,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
             chosen[name] = replace(said, initial=calibrated.parameter_values[name])
         write_text(out, config_yaml_with_defaults(replace(calibrated.settings, parameters=chosen)))
         head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
-        return head | {"effects": {}, "parameters": {}, "gate": None}
+        return head | {"unknown": unknown, "effects": {}, "parameters": {}, "gate": None}
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasps = {g.name: _grasp_support(form, supports.get(f"grasp_compliance@{g.name}")) for g in full.grasps}
@@ -186,15 +187,16 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "result": file_sha256(folder / "result.json"),
         "effects": {label: vars(entry) for label, entry in supports.items()},
         "parameters": parameters,
+        "unknown": unknown,
         "grasps": {name: vars(entry) for name, entry in grasps.items()},
         "gate": None,
         "versions": software_and_plugin_versions(),
     }
-    if form == "mjcf":
-        manifest["gate"] = _gate(calibrated, system, text, progress)
-    manifest = to_json_types(manifest)
     write_text(out, text)
     try:
+        if form == "mjcf":
+            manifest["gate"] = _gate(calibrated, system, text, progress)
+        manifest = to_json_types(manifest)
         write_strict_json(out.with_name(f"{out.name}.manifest.json"), manifest)
     except BaseException:
         out.unlink(missing_ok=True)  # without its manifest, a model would not state its losses
@@ -229,7 +231,7 @@ def _refuse_losses(
     if lost and not is_lossy:
         what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
         other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
-        hint = f"{other}add --lossy to leave them out; the manifest beside the file (.json) has the reason for each"
+        hint = f"{other}add --lossy to leave them out, with a manifest that has the reason for each"
         raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)
 
 

@@ -21,7 +21,7 @@ from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough
 from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun, grouped
 from yid_ocp.errors import ConfigError, require_known_names
 from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
@@ -222,10 +222,8 @@ class _IdentifiabilityTasks:
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
         """Return the expected result of the experiment with each set of changes; one task per changed setup."""
-        groups: dict[str, list[int]] = {}
-        for i, changes in enumerate(sets):
-            setup = sorted({change.setup_change for change in changes if change.setup_change})
-            groups.setdefault(" and ".join(setup) or "sensors", []).append(i)
+        setups = (sorted({change.setup_change for change in changes if change.setup_change}) for changes in sets)
+        groups = grouped((" and ".join(setup) or "sensors", i) for i, setup in enumerate(setups))
         named = [[change.name for change in changes] for changes in sets]
         own = {name: [named[i] for i in members] for name, members in groups.items()}
         tasks = {name: {"sets": members, "inflation": inflation} for name, members in own.items()}

@@ -88,7 +88,8 @@ def copyable_estimate_texts(
         return {}
     terms, springs, joints = _found_joint_terms(system, theta, found), system.elastic_joints, []
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
-    lines = [_mjcf_joint_line(joint, own) for joint, own in terms.items() if own and joint not in links]
+    turning = [joint.name for joint in system.mechanism.joints if joint.kind == "revolute"]
+    lines = [_mjcf_joint_line(joint, own, turning) for joint, own in terms.items() if own and joint not in links]
     for layout in system.segment_layouts:
         for key in ((layout.name, "bend"), (layout.name, "twist")):
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
@@ -131,9 +132,9 @@ def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> di
     return found
 
 
-def _mjcf_joint_line(joint: str, attributes: Mapping[str, float]) -> str:
+def _mjcf_joint_line(joint: str, attributes: Mapping[str, float], turning: Sequence[str]) -> str:
     shown = " ".join(f'{key}="{size:.4g}"' for key, size in attributes.items())
-    note = ' <!-- with compiler angle="radian" -->' if "springref" in attributes else ""
+    note = ' <!-- with compiler angle="radian" -->' if joint in turning and attributes.get("springref") else ""
     return f'<joint name="{joint}" {shown}/>{note}'
 
 

@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 
 from yid_ocp import interruption
 from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, grouped
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, folder_error, os_error_reason, to_json_types, write_text
 from yid_ocp.report.html import write_report
@@ -68,9 +68,7 @@ class RunFolder:
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
         if notes:  # many of one key are one note
-            groups: dict[str, list[str]] = {}
-            for note in notes:
-                groups.setdefault(note.rpartition(".")[2], []).append(note)
+            groups = grouped((note.rpartition(".")[2], note) for note in notes)
             shown = ([f"{tail} ({len(own)} times)"] if len(own) > 3 else own for tail, own in groups.items())
             clean["notes"] = [*itertools.chain.from_iterable(shown)]
         write_text(self.path / name, json.dumps(clean, indent=1, allow_nan=False) + "\n")

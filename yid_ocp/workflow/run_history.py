@@ -70,8 +70,8 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
         raise DataError(what, where=str(file), allowed=allowed, hint=again) from error
     if not names:
-        what, hint = "the run has no parameter with a standard deviation", "use a run that has estimated a parameter"
-        raise DataError(what, where=str(file), allowed="one parameter or more in `covariance`", hint=hint)
+        what, hint = "the run has found no parameter", "use a run that has found a parameter"
+        raise DataError(what, where=str(file), allowed="one parameter or more with a standard deviation", hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)

@@ -154,8 +154,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
     Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file.
     """
     files = {"configuration": Path(run.config_file)} if run.config_file else {}
-    for i, path in enumerate(run.plugins):
-        files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
+    files |= {path: _existing(run, Path(path), "plug-in", "plugins", i) for i, path in enumerate(run.plugins)}
     robot = run.model.robot
     if robot is not None:
         with add_setting_location_to_errors(run, "model", "robot"):

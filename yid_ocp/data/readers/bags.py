@@ -23,7 +23,7 @@ from yid_ocp.data.foreign_formats import (
 )
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
+from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text, grouped
 from yid_ocp.errors import DataError, import_optional, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, file_sha256, limit_process_memory
 
@@ -484,14 +484,10 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
             channels[channel] = np.array(rows)
     if "position" not in channels:
         allowed, hint = "messages whose `position` is filled", "choose another topic: --joint-topic TOPIC"
-        what = f"the {len(states)} joint states have no positions"
-        raise DataError(what, where=where, allowed=allowed, hint=hint)
+        raise DataError(f"the {len(states)} joint states have no positions", where=where, allowed=allowed, hint=hint)
     values = np.hstack([t[:, None], *channels.values()])
     own = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))  # a message that is sent twice counts once
     return JointGroup(entry.wanted, t[own], **{name: values[own] for name, values in channels.items()})
-
-
-_MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
 def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
@@ -511,7 +507,9 @@ def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
     return names
 
 
-def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) -> _MessagesByFrame:
+def _named_places(
+    bag: _Contents, points: Mapping[str, str] | None, where: str
+) -> dict[str, list[tuple[str, BagMessage]]]:
     """Names and messages of the points by reference frame. `points`: None for all except frames of transform trees."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
@@ -520,12 +518,8 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
         if source not in present:
             bag.file.check_topic_is_one_of(source, known, "points")
     base.check_unique_point_names(names, where)
-    groups: _MessagesByFrame = {}
-    for message in bag.places:
-        if message.source in names:
-            frame = message.content.frame.strip("/") or "unknown"
-            groups.setdefault(frame, []).append((names[message.source], message))
-    return groups
+    named = ((names[message.source], message) for message in bag.places if message.source in names)
+    return grouped((own[1].content.frame.strip("/") or "unknown", own) for own in named)
 
 
 def _with_axes(entries: Iterable[tuple[str, BagMessage]], distance: float | None) -> Iterator[tuple[str, BagMessage]]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period
+from yid_ocp.data.foreign_formats import UNIT_BY_WORD
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.registry import Registry
@@ -65,18 +66,19 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
     """Parse units by quantity from words such as `deg` or `velocity=rpm`. Raises `DataError` if one is invalid."""
     units, exact = dict[str, str](), dict[str, str]()
     for word in words:
-        quantity, equals, unit = word.partition("=")
+        quantity, equals, unit = word.rpartition("=")
+        unit = UNIT_BY_WORD.get(unit.strip().lower(), unit.strip())
         if equals:
-            _set_unit(exact, quantity.strip(), unit.strip())
+            _set_unit(exact, quantity.strip(), unit)
             continue
-        of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
+        of = next((si for si, known in _TO_SI.items() if _spaceless(unit) in map(_spaceless, known)), None)
         if of is None:
             every = dict.fromkeys(chain(*_TO_SI.values()))  # metres are units of two quantities
             said = unknown_name_error_arguments(word, every, "write for example --units deg,mm")
             raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
-        own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or word not in MOTOR_CURRENT_UNITS)]
+        own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or unit not in MOTOR_CURRENT_UNITS)]
         for quantity in own:
-            _set_unit(units, quantity, word)
+            _set_unit(units, quantity, unit)
     return units | exact
 
 

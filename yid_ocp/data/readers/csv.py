@@ -114,12 +114,12 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     wanted = [(axis, name) for name in point_names for axis in AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
     mounted = _mounted_sensors(meanings, table, where)
-    is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
+    has_points_only = not joint_names and not mounted
 
     def measured(values: Sequence[Array]) -> IntArray:
-        """Indices of the rows in which not all `values` are NaN; of all rows if the table has no other group."""
+        """Indices of the rows in which not all `values` are NaN; of all rows if the table has points only."""
         flat = np.hstack([entry.reshape(len(table), -1) for entry in values])
-        return np.arange(len(t)) if is_alone else np.flatnonzero(~np.isnan(flat).all(axis=1))
+        return np.arange(len(t)) if has_points_only else np.flatnonzero(~np.isnan(flat).all(axis=1))
 
     joints, points, sensors = None, list[PointGroup](), list[SensorChannelGroup]()
     if joint_names:
@@ -368,10 +368,10 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             try:
                 numbers.append(_parsed_number(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                allowed = "a number, or an empty cell if there was no measurement"
+                allowed = "a number; empty cells if no joint, or the whole point or sensor, was measured at this time"
                 allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
                 what = f"the cell '{cell}' in column '{name}' is not a number"
-                hint = f"correct or empty the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
+                hint = f"correct the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
@@ -389,8 +389,7 @@ def _meanings(
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
             raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
-        for name, match in found.items():
-            given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
+        given |= {name: meaning.replace("*", own.group(1)) if "*" in key else meaning for name, own in found.items()}
     meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
     by_name, stated = column_meanings(header, _COMPONENTS)
     units: dict[str, str] = {}
@@ -431,8 +430,9 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
-        hint = nearest_name_question(kind, known) or f"write for example --columns '{column}=position:JOINT'"
-        hint = f"write --columns '{column}={kind}:NAME'" if kind in known else hint
+        meant = (kind, "NAME") if kind in known else column_meanings([given], _COMPONENTS)[0][0]  # `torque:elbow`
+        hint = "" if meant else nearest_name_question(kind, known)
+        hint = hint or f"write for example --columns '{column}={':'.join(meant or ('position', 'JOINT'))}'"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
@@ -446,6 +446,5 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
             hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column
             lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]
-            hint = nearest_name_question(meaning[1], lone) or hint
-            raise DataError(what, where=where, allowed=allowed, hint=hint)
+            raise DataError(what, where=where, allowed=allowed, hint=nearest_name_question(meaning[1], lone) or hint)
     return table[:, [places[meaning] for meaning in wanted]]

@@ -125,8 +125,7 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
             own = {method: findings.result["methods"][method]["parameters"][name] for method in ended}
             values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
             rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
-    for _, figure in draw_figure_per_unit(rows, figures.parameter_values_by_source_figure):
-        yield "Estimates", figure
+    yield from (("Estimates", own) for _, own in draw_figure_per_unit(rows, figures.parameter_values_by_source_figure))
     costs = {}
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
