@@ -8,8 +8,10 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 _MAX_NAMES_IN_LINE = 12  # names in a line; tables list all
 _MAX_NOTEBOOK_ROWS = 30  # largest number of table rows in a notebook; further rows are only counted
 
@@ -91,9 +93,9 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
     return ", ".join(said) + (f" and {left} more" if left else "")
 
 
-def grouped(pairs: Iterable[Sequence[Any]]) -> dict[Any, list[Any]]:
+def grouped(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     """Return the values of (key, value) pairs by key, in their order."""
-    found: dict[Any, list[Any]] = {}
+    found: dict[_Key, list[_Value]] = {}
     for key, value in pairs:
         found.setdefault(key, []).append(value)
     return found
@@ -101,7 +103,7 @@ def grouped(pairs: Iterable[Sequence[Any]]) -> dict[Any, list[Any]]:
 
 def unseen_effects_sentence(labels: Sequence[str]) -> str:
     """Sentence on effects that recordings would not show. Empty if there are none."""
-    known = grouped(label.split("@") for label in labels).items()
+    known = grouped(label.partition("@")[::2] for label in labels).items()
     kinds = [f"{kind} ({len(own)} places)" if len(own) > 1 else f"{kind}@{own[0]}" for kind, own in known]
     return f"These recordings would not show these effects, even if they exist: {', '.join(kinds)}." if kinds else ""
 

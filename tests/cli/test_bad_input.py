@@ -86,10 +86,9 @@ def test_no_such_configuration(cli, pendulum):
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
     assert_refused(cli("solve", folder / "x.h5"), "x.h5 is a recording, not a configuration", "init ROBOT.urdf")
     assert_refused(cli("check", folder), "this is a folder, but must be a file", "a YAML file")
-    (folder / "list.yaml").write_text("- 1\n")
-    assert_refused(cli("solve", folder / "list.yaml"), "but no keys")
-    (folder / "latin.yaml").write_bytes(b"description: \xe9\n")
-    assert_refused(cli("solve", folder / "latin.yaml"), "UTF-8")
+    for text, words in ((b"- 1\n", "but no keys"), (b"description: \xe9\n", "UTF-8")):
+        (folder / "odd.yaml").write_bytes(text)
+        assert_refused(cli("solve", folder / "odd.yaml"), words)
 
 
 def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):

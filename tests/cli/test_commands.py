@@ -212,8 +212,7 @@ def test_a_wrong_command_line_is_told_like_all_that_is_wrong(cli, arguments, wor
 def test_check(carried_out, pendulum):
     done = carried_out("check", pendulum)
     result = done.result
-    assert result["format"] == "yid-check/1"
-    assert result["model"]["n"] == 2
+    assert (result["format"], result["model"]["n"]) == ("yid-check/1", 2)
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
     shown = "`solve` tests how links and time step change", "100 Hz", "run folder: run"
     assert [text for text in shown if text not in done.out] == []

@@ -79,9 +79,7 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
     evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
     assert (evidence.warrants_effect_search(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
-    assert not replace(evidence, discretisation_chi2=1e9).warrants_effect_search(limits), (
-        "links and steps may remove it"
-    )
+    assert not replace(evidence, discretisation_chi2=1e9).warrants_effect_search(limits), "the step may remove it"
 
 
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
@@ -166,9 +164,8 @@ def test_equivalent_effects_share_the_probability_of_their_set():
     last, seen = fit([ONE, THIRD]), f.screening([f.score(own) for own in (ONE, OTHER, THIRD)])
     chosen = (replace(added(ONE, [OTHER], last), shares=(0.7, 0.3)), added(THIRD, fitted=last))
     told = f.finding("confusable", selected_effects=chosen, single_effect_models=(), screening=seen).to_dict()["which"]
-    assert {own["kind"]: own["probability"] for own in told} == pytest.approx(
-        {ONE.kind: 0.63, OTHER.kind: 0.27, THIRD.kind: 0.9}
-    )
+    wanted = {ONE.kind: 0.63, OTHER.kind: 0.27, THIRD.kind: 0.9}
+    assert {own["kind"]: own["probability"] for own in told} == pytest.approx(wanted)
 
 
 @cases(

@@ -264,9 +264,8 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     joint = line.replace("<joint ", '<joint axis="0 0 1" ')
     body = f'<body><geom size="1"/>{joint}</body>'
     model = mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody></mujoco>')
-    elbow = model.joint("elbow")
-    assert (elbow.stiffness[0], model.qpos_spring[0], elbow.damping[0]) == (4.0, pytest.approx(0.2), 0.3)
-    assert (elbow.frictionloss[0], elbow.armature[0]) == (0.5, 0.01)
+    told = (model.jnt_stiffness, model.qpos_spring, model.dof_damping, model.dof_frictionloss, model.dof_armature)
+    assert np.ravel(told).tolist() == pytest.approx([4.0, 0.2, 0.3, 0.5, 0.01])
     only = copied(system, values, **{"elbow.damping": found["elbow.damping"]})
     assert only["mjcf"] == ['<joint name="elbow" damping="0.3"/>']
     assert copied(system, values, **{"shoulder.mass": (1.0, 0.1, "kg", "identifiable")})["mjcf"] == []

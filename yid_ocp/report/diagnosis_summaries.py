@@ -85,7 +85,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
     rows = [
         ("effect", "places"),
-        *((k, ", ".join(own)) for k, own in grouped(label.split("@") for label in unseen).items()),
+        *((k, ", ".join(own)) for k, own in grouped(label.partition("@")[::2] for label in unseen).items()),
     ]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
