@@ -146,8 +146,8 @@ def test_parameters_that_rounding_cannot_tell_apart_share_the_step():
 
 def test_variances_stay_within_their_range(monkeypatch):
     assert set(smoothed(monkeypatch, [made(3, size=np.full(3, 1e9))]).group_variance.values()) == {1e7}
-    assert smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6}, 0.0)[0][FORCE] >= 1e-6
-    assert smoother._refined([made(1, loose=1e12)], NOTHING, 0.0)[1].log_evidence == -math.inf
+    assert smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6}, 0.0).variance[FORCE] >= 1e-6
+    assert smoother._refined([made(1, loose=1e12)], NOTHING, 0.0).log_evidence == -math.inf
 
 
 def test_a_group_may_hold_several_unknowns_and_some_of_them_errors_that_are_known(monkeypatch):

@@ -274,7 +274,8 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
         return seen
     problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
-    if refitted is None or not (gain := 2 * (fit.cost - refitted.cost)) > least:
+    gain = 0.0 if refitted is None else 2 * (fit.cost - refitted.cost)
+    if refitted is None or not gain > least:
         return seen
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
     seen.search.progress.begin_stage(said)

@@ -20,6 +20,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
+from yid_ocp.display import grouped
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import failed_rollout_error
 from yid_ocp.inference import null_test
@@ -292,9 +293,7 @@ def screen_candidates(
     """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
     point = linearize_candidates(problem, base, values)
     series, residual = channels_with_residual_indices(problem.problem), point.projected_residual
-    grids = dict[str, list[_EffectSignature]]()
-    for own in point.signatures:
-        grids.setdefault(own.effect.label, []).append(own)
+    grids = grouped((own.effect.label, own) for own in point.signatures)
     visible, scores, kept = list[CandidateDetectability](), list[ScoreTestResult](), list[_EffectSignature]()
     for grid in grids.values():
         # the smallest amplitude that is detectable at `DETECTABLE_AMPLITUDE_Z` stds

@@ -211,8 +211,8 @@ class _State:
     scores: dict[SmoothedUnknownGroup, tuple[float, float]]
     # largest log evidence with one more group, and the group's variance
     larger: dict[SmoothedUnknownGroup, tuple[float, float]] = field(default_factory=dict)
-    # variances with one more group at the largest evidence, and the result there
-    refined: dict[SmoothedUnknownGroup, tuple[_Variances, _State]] = field(default_factory=dict)
+    # result of `_refined` with one more group
+    refined: dict[SmoothedUnknownGroup, _State] = field(default_factory=dict)
 
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
         """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
@@ -238,7 +238,7 @@ def _run(models: _Models, variance: _Variances) -> _State:
     evidence, shift, information = _judged(products, sum(done.log_determinant for done in filtered))
     spread = scipy.linalg.cho_solve(information, np.eye(len(shift)))
     known = tuple(itertools.chain(*recordings))
-    scores = {} if math.isinf(evidence) else _scores(models, known, shift, spread)
+    scores = _scores(models, known, shift, spread) if len(known) == len(models) else {}
     return _State(models, variance, known, shift, spread, evidence, scores)
 
 
@@ -269,35 +269,30 @@ def _scores(
     return found
 
 
-def _refined(models: _Models, variance: _Variances, before: float) -> tuple[_Variances, _State]:
-    """Variances of the selected groups by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation.
+def _refined(models: _Models, variance: _Variances, before: float) -> _State:
+    """Result at the largest evidence, by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation.
 
     `before` is the log evidence without the group that was added last.
     """
     state = _run(models, variance)
-    if math.isinf(state.log_evidence):
-        return variance, state
-    for _ in range(_MAX_STD_ITERATIONS):
+    for _ in range(_MAX_STD_ITERATIONS if math.isfinite(state.log_evidence) else 0):
         ratio = {s: np.clip(up / max(down, 1e-300), 0.05, 20.0) for s, (up, down) in state.scores.items()}
-        trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in variance.items()}
+        trial = {s: float(np.clip(v * ratio[s], *_VARIANCE_BOUNDS)) if v else 0.0 for s, v in state.variance.items()}
         after = _run(models, trial)
         gained = after.log_evidence - state.log_evidence
-        if gained > 0:
-            variance, state = trial, after
+        state = after if gained > 0 else state
         if not gained > max(_MIN_EVIDENCE_GAIN, _MIN_EVIDENCE_GAIN_FRACTION * (state.log_evidence - before)):
             break
-    return variance, replace(state, recordings=())
+    return replace(state, recordings=())
 
 
-def _selected(
-    models: _Models, sources: _Groups, variance: _Variances, state: _State, least: float
-) -> tuple[_Variances, float]:
-    """Repeatedly add the group that raises the log evidence most, by more than `least`. Variances and evidence."""
-    while sum(v > 0 for v in variance.values()) < _MAX_GROUPS:
+def _selected(models: _Models, sources: _Groups, state: _State, least: float) -> _State:
+    """Repeatedly add the group that raises the log evidence most, by more than `least`."""
+    while sum(v > 0 for v in state.variance.values()) < _MAX_GROUPS:
         found = state.scores
-        promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
+        promising = [s for s in sources if not state.variance[s] and found[s][0] > found[s][1]]
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))
-        if any(variance.values()):
+        if any(state.variance.values()):
             promising = promising[:_LATER_GROUP_TRIALS]
         if not promising:
             break
@@ -306,12 +301,11 @@ def _selected(
         if not evidence > state.log_evidence + least:
             break
         if source not in state.refined:
-            state.refined[source] = _refined(models, variance | {source: size}, state.log_evidence)
-        more, after = state.refined[source]
-        if math.isinf(after.log_evidence):
+            state.refined[source] = _refined(models, state.variance | {source: size}, state.log_evidence)
+        if math.isinf(state.refined[source].log_evidence):
             break
-        variance, state = more, after
-    return variance, state.log_evidence
+        state = state.refined[source]
+    return state
 
 
 def _response_products(base: _Filtered, chosen: IntArray, correlation: float) -> tuple[Array, Array]:
@@ -392,17 +386,16 @@ def smooth_unknown_forces_and_biases(
     with threadpoolctl.threadpool_limits(1):
         models = residual_models_with_smoother_unknowns(problem, x, evaluation)
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
-        none = dict.fromkeys(sources, 0.0)
-        nothing = _run(models, none)
+        nothing = _run(models, dict.fromkeys(sources, 0.0))
         sides = {"both": sources, "plant": tuple(s for s in sources if s.kind != "bias")}
         sides["sensor"] = tuple(s for s in sources if s.kind == "bias")
-        found: dict[str, tuple[_Variances, float]] = {}
+        found: dict[str, _State] = {}
         for side, own in sides.items():
-            done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
-            found[side] = done[0] if done else _selected(models, own, none, nothing, least)
-        gain = {side: evidence - nothing.log_evidence for side, (_, evidence) in found.items()}
+            done = [state for state in found.values() if {s for s, v in state.variance.items() if v} <= set(own)]
+            found[side] = done[0] if done else _selected(models, own, nothing, least)
+        gain = {side: state.log_evidence - nothing.log_evidence for side, state in found.items()}
         # a greedy choice among all groups may be worse than a choice among fewer; filters are too large to keep all
-        variance = max(found.values(), key=lambda entry: entry[1])[0]
+        variance = max(found.values(), key=lambda state: state.log_evidence).variance
         state = _run(models, variance) if any(variance.values()) else nothing
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)

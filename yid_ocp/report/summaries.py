@@ -539,7 +539,12 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for name in dict.fromkeys(result["asked"] or shown):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        sight = "" if seen is None or not rows else "all" if len(seen) == len(rows) else _row_names_text(seen) or "none"
+        if seen is None or not rows:
+            sight = ""
+        elif len(seen) == len(rows):
+            sight = "all"
+        else:
+            sight = _row_names_text(seen) or "none"
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])
