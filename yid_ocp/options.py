@@ -103,6 +103,12 @@ def variadic_tuple_entry_type(hint: Any) -> Any:
     return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
 
 
+def literal_choices(hint: Any) -> list[str]:
+    """Return the words that a type allows, if it is a `Literal` or a union with one."""
+    found = (split_annotated(member)[0] for member in non_none_union_members(hint))
+    return [str(word) for bare in found if get_origin(bare) is Literal for word in get_args(bare)]
+
+
 def describe_type(hint: Any) -> str:
     """Describe a type, its range and its unit in words for messages, such as "a number above 0 up to 0.1 [s]"."""
     bare, markers = split_annotated(hint)
@@ -126,7 +132,7 @@ def _words(hint: Any) -> str:
         count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
         return f"a list{count}, each {_words(arguments[0])}".replace(", each a section", " of sections", 1)
     if mapping_value_type(bare) is not None:
-        return f"names, each with {_words(mapping_value_type(bare))}"
+        return f"{{NAME: {_words(mapping_value_type(bare))}, ...}}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
     needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
     return "a section" + f", such as {{{needed}}}" * bool(needed)
@@ -146,7 +152,7 @@ def default_value_hint(key: str, default: Any) -> str:
     """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
     if isinstance(default, (int, float, str)):
         return f"set {key} to an allowed value, such as {default}"
-    return f"write {key} in the form that is allowed" + ", or leave it out" * (default is not MISSING)
+    return f"write {key} in the allowed form" + ", or leave it out" * (default is not MISSING)
 
 
 def _within(hint: Any, value: Any) -> bool:

@@ -34,7 +34,7 @@ def test_a_solve_that_does_not_converge(carried_out, pendulum):
 
 def test_a_rollout_that_fails_leaves_reason_and_best_point(carried_out, pendulum, monkeypatch):
     told = "estimate: step 3: Newton's method did not converge"
-    monkeypatch.setattr(EpisodePredictor, "predict_episodes", lambda predictor, asked, derivatives: [told] * len(asked))
+    monkeypatch.setattr(EpisodePredictor, "predict_episodes", lambda predictor, asked, derivatives: iter([told]))
     done = carried_out("solve", pendulum, codes=(1,))
     result = done.result
     assert result["status"] == "failed"

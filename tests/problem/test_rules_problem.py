@@ -230,7 +230,7 @@ def test_costs_and_derivatives_that_are_not_finite_are_failures(make, monkeypatc
     failing = problem.evaluate(problem.initial_unknowns + 0.01)
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
     assert "cost is not finite" in failing.message
-    problem = make(free=("elbow.rest",))
+    problem = make(free=("elbow.rest",), prior_stds={"elbow.rest": 1.0})
     steep = SimpleNamespace(residual_and_jacobian=lambda x: (np.zeros(1), np.full((1, 1), np.inf)))
     monkeypatch.setattr(problem, "priors", steep)
     failing = problem.evaluate(problem.initial_unknowns)

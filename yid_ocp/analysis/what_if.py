@@ -222,8 +222,8 @@ class _Outcomes:
         found = []
         for done, changes in enumerate(sets, 1):
             found.append(own := self._outcome(changes))
-            text = f"{own.identifiable} of {len(own.verdicts)} parameters found" if own.verdicts else "no result"
-            self.progress.report_parts_done(done, len(sets), f"{text} with {own.description}")
+            text = f"{own.identifiable} of {len(own.verdicts)} parameters found" if own.verdicts else "not simulated"
+            self.progress.report_parts_done(done, len(sets), f"{text}: {own.description}")
         return found
 
     def _outcome(self, changes: Sequence[ExperimentChange]) -> ChangedExperimentResult:

@@ -149,10 +149,13 @@ _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
-    rows, units = problem.residual_rows, np.ones(len(evaluation.residual))
-    units[rows.data] = problem.stated_rms_noise_of_data_residuals
-    units = units[kept := rows.slice_of_data_and_stated_priors]
-    return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
+    kept, noise = problem.residual_rows.slice_of_data_and_stated_priors, problem.stated_rms_noise_of_data_residuals
+    residual, jacobian = evaluation.residual[kept], evaluation.jacobian[kept]
+    if noise == 1.0:  # no copy, which may be large
+        return residual, jacobian
+    units = np.ones(len(residual))
+    units[problem.residual_rows.data] = noise
+    return residual / units, jacobian / units[:, None]
 
 
 def orthonormal_basis_and_coefficients(matrix: Array, columns: Array) -> tuple[Array, Array]:

@@ -175,7 +175,7 @@ def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluatio
     """Compute F (nx, nx) of the unknowns' covariance F F' from noise alone. F is precise in weak directions, too."""
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
     _, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
-    _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
+    _, singular, vectors = np.linalg.svd(np.linalg.qr(jacobian * scale, mode="r"), full_matrices=False)
     if len(vectors) < count:
         rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
         vectors, singular = np.vstack([vectors, rest.T]), np.pad(singular, (0, count - len(singular)))

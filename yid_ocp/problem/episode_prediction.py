@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -223,12 +223,15 @@ class EpisodePredictor:
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodePrediction | str:
         """Simulate an episode and predict its samples. Returns an error message if the simulation fails."""
-        return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
+        return next(self.predict_episodes([(episode, theta, offset, guess)], derivatives))
 
     def predict_episodes(
         self, queries: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
-    ) -> list[EpisodePrediction | str]:
-        """Predict several episodes, each given as (episode, theta, offset, guess). A failure gives an error message."""
+    ) -> Iterator[EpisodePrediction | str]:
+        """Predict episodes one after the other, each given as (episode, theta, offset, guess).
+
+        A failure gives an error message. Few episodes are predicted at once, because derivatives need much memory.
+        """
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
@@ -240,12 +243,12 @@ class EpisodePredictor:
         width = len(self.unknowns.free_parameter_names) + len(self.estimated_initial_state_indices)
         bytes_per_node = 8 * self.integrator_step.sizes["nx"] * (derivatives * width + 1)
         each = [(episode.grid.steps + 1) * bytes_per_node for episode, *_ in queries]
-        found: list[EpisodePrediction | str] = []
-        while len(found) < len(queries):
-            held = np.cumsum(each[len(found) :][:_MAX_PARALLEL_ROLLOUTS])
+        done = 0
+        while done < len(queries):
+            held = np.cumsum(each[done:][:_MAX_PARALLEL_ROLLOUTS])
             count = max(int(np.searchsorted(held, _MAX_ROLLOUT_MEMORY, "right")), 1)
-            found += part(queries[len(found) : len(found) + count])
-        return found
+            yield from part(queries[done : done + count])
+            done += count
 
     def _prepared(
         self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool

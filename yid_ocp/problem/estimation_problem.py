@@ -232,24 +232,25 @@ class EstimationProblem(ReprMixin):
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
         asked = [(e, *self.unpack_episode_unknowns(x, i), guess) for i, (e, guess) in enumerate(pairs)]
-        results = self.predictor.predict_episodes(asked, derivatives)
-        if failures := [result for result in results if isinstance(result, str)]:
-            return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
-        done = [result for result in results if isinstance(result, EpisodePrediction)]
-        del results  # derivatives are the largest arrays
-        cost, residuals, jacobians = 0.0, [], []
-        threshold = self.options.huber_threshold
-        for i, result in enumerate(done):
+        layout, threshold = self.residual_rows, self.options.huber_threshold
+        prior, prior_jacobian = self.priors.residual_and_jacobian(x)
+        cost, residuals, done = 0.0, list[Array](), list[EpisodePrediction]()
+        jacobian = np.zeros((layout.weak_priors.stop, len(x))) if derivatives else None
+        for i, result in enumerate(self.predictor.predict_episodes(asked, derivatives)):
+            if isinstance(result, str):
+                return Evaluation(np.inf, np.zeros(0), None, False, result, ())
             part = episode_residual_and_jacobian(self.episodes[i], self.whitening_filters[i], result, threshold)
             cost += part.cost
             residuals.append(part.residual)
-            if part.jacobian is not None:
-                jacobians.append(self.unknowns.scatter_to_unknown_columns(part.jacobian, i))
-            done[i] = replace(result, output_sensitivities=None, torque_correction_sensitivity=None)
-        prior, prior_jacobian = self.priors.residual_and_jacobian(x)
+            if jacobian is not None and part.jacobian is not None:
+                own = layout.slice_of_recording(i)
+                jacobian[own, self.unknowns.unknown_indices_affecting_recording(i)] = part.jacobian
+            # derivatives are the largest arrays
+            done.append(replace(result, output_sensitivities=None, torque_correction_sensitivity=None))
         residual = np.concatenate([*residuals, prior])
         cost += 0.5 * float(prior @ prior)
-        jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
+        if jacobian is not None:
+            jacobian[layout.data.stop :] = prior_jacobian
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", tuple(done))
         if jacobian is not None and not np.all(np.isfinite(jacobian)):

@@ -84,7 +84,7 @@ class ZeroPhaseLowPassFilter:
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
             allowed = f"0 (automatic), or above {least:.2g} and below {nyquist:g} Hz (half the rate of this recording)"
-            what = f"the low-pass cutoff of {self.cutoff:g} Hz is not above {least:.2g} and below {nyquist:g} Hz"
+            what = f"samples {step:.3g} s apart cannot be low-pass filtered at {self.cutoff:g} Hz"
             hint = "set problem.path_cutoff: 0, or if it is 0, a smaller problem.time_step"
             raise DataError(what, where="problem.path_cutoff", allowed=allowed, hint=hint)
         warped = math.tan(math.pi / 2 * self.cutoff / nyquist)

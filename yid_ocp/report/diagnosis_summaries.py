@@ -40,6 +40,7 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
+_MAX_REPRODUCED_ERROR = 3  # largest error of a replay that reproduces a recording [noise std]
 _MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits; 0.5 is one standard deviation
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
@@ -126,7 +127,9 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
             if own["value"] is not None and own["std"] is not None:
                 values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
             elif own["value"] is not None:
-                values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
+                values.append(
+                    f"{name} = {round(own['value'], 12):.3g}{unit}" if entry["closure"] is None else f"{name} unknown"
+                )
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
@@ -540,9 +543,12 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
-        text = f"In MuJoCo, the error of {worst} on {held} is {ratios[worst]:.4g} times its noise, the largest ratio of"
-        more = "far above 1, errors of the recorded torques may also be the cause"
-        yield f"{text} all channels. A ratio near 1 means that the file explains the recordings; {more}."
+        is_good = ratios[worst] < _MAX_REPRODUCED_ERROR
+        text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}. The error of"
+        yield f"{text} {worst} is the largest, {ratios[worst]:.4g} times its noise."
+        if not is_good and "joints.position" in gate["channels"]:  # arms move by their torques
+            text = "Errors of recorded torques can cause this too. To exclude them, solve and export again with"
+            yield f"{text} --set model.arms.mode=prescribed, which moves the arms as measured."
     if (fall := gate["fall"]) is not None:
         change = f"{100 * abs(fall):.3g} % {'more' if fall < 0 else 'less'}"
         yield f"In MuJoCo, the error beyond noise on {held} is {change} than without estimates."
