@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +21,8 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test, whitening
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
-from yid_ocp.parallel import map_with_merged_calls
+from yid_ocp.integrator.compiled import MAX_BATCHED_COLUMNS
+from yid_ocp.parallel import map_in_threads, map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.solvers import GaussNewton, Status
@@ -396,8 +398,14 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
+    layout, batch = (
+        search.problem.problem.unknowns,
+        partial(map_with_merged_calls, questions_per_item=search.n_recordings),
+    )
+    is_wide = len(layout.free_parameter_names) + len(layout.initial_state_names) > MAX_BATCHED_COLUMNS
+    at_once = map_in_threads if is_wide else batch  # waiting fits would keep their memory
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
-        fits += map_with_merged_calls(one, tried[i : i + size], search.n_recordings)
+        fits += at_once(one, tried[i : i + size])
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from yid_ocp.arrays import Array, IntArray
@@ -144,6 +143,7 @@ class ResidualDerivativesByStateAndEffort:
 
 # A fit is complete if no step predicts a larger cost reduction than this part of the cost, or this in noise units.
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
+_FACTORED_ROWS = 8192  # of a Jacobian that are factored at once, since factoring copies them
 
 
 def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
@@ -171,13 +171,20 @@ def orthonormal_basis_and_coefficients(matrix: Array, columns: Array) -> tuple[A
     return basis, (vt[kept].T / singular[kept]) @ (basis.T @ columns) / scale[:, None]
 
 
+def triangular_factor(jacobian: Array, residual: Array) -> Array:
+    """Return R (n + 1, n + 1) with |J d + r| = |R (d, 1)| for all d (n,), for J and r of any number of rows."""
+    count = jacobian.shape[1] + 1
+    factor = np.zeros((count, count))
+    for i in range(0, len(residual), _FACTORED_ROWS):
+        rows = np.column_stack([part[i : i + _FACTORED_ROWS] for part in (jacobian, residual)])
+        factor = np.asarray(np.linalg.qr(np.vstack([factor, rows]), mode="r"))
+    return factor
+
+
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Return d in [lower, upper] that minimises |J d + r|^2 + mu c |d|^2; c is the largest squared column norm of J."""
-    count = jacobian.shape[1]
-    factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
-    small = np.zeros((count + 1, count + 1))
-    small[: len(factor)] = factor
-    weight = np.sqrt(mu * max(float(np.max(np.sum(jacobian**2, axis=0), initial=0.0)), 1e-300))
+    count, small = jacobian.shape[1], triangular_factor(jacobian, residual)
+    weight = np.sqrt(mu * max(float(np.max(np.sum(small[:, :count] ** 2, axis=0), initial=0.0)), 1e-300))
     matrix = np.vstack([small[:, :count], weight * np.eye(count)])
     target = np.concatenate([-small[:, count], np.zeros(count)])
     plain = np.linalg.lstsq(matrix, target, rcond=None)[0]
@@ -209,7 +216,8 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
         return math.inf
     if not len(x):
         return 0.0
-    step = size_limited_damped_step(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
+    reduced = triangular_factor(evaluation.jacobian, evaluation.residual)
+    step = size_limited_damped_step(problem, x, reduced[:, :-1], reduced[:, -1], 1e-14)
     return predicted_cost_reduction_by_step(evaluation.jacobian, evaluation.residual, step)
 
 

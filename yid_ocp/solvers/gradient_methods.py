@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 from annotated_types import Ge, Gt, Lt
 
@@ -18,6 +17,7 @@ from yid_ocp.inference.linearized_residual import (
     is_stationary_point,
     max_abs_projected_gradient,
     predicted_cost_reduction_by_step,
+    triangular_factor,
 )
 from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
 from yid_ocp.options import OptionInfo
@@ -109,7 +109,9 @@ class GaussNewton(base.SolverWithCheckedSettings):
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
-            scaled, mu = _step_within_length(jacobian * size, residual, mu, low, (upper - x) / size, longest)
+            reduced = triangular_factor(jacobian, residual)
+            reduced[:, :-1] *= size
+            scaled, mu = _step_within_length(reduced, mu, low, (upper - x) / size, longest)
             step = size * scaled
             promised = predicted_cost_reduction_by_step(jacobian, residual, step)
             # damping makes any step promise little
@@ -140,13 +142,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 return ended(base.Status.STALLED, message)
 
 
-def _step_within_length(
-    jacobian: Array, residual: Array, mu: float, low: Array, high: Array, longest: float
-) -> tuple[Array, float]:
+def _step_within_length(reduced: Array, mu: float, low: Array, high: Array, longest: float) -> tuple[Array, float]:
     """Damped step within bounds, and its damping, which is raised until the step is at most `longest`."""
-    # the triangular factor has the same normal equations
-    reduced = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0]
-    reduced = reduced[: jacobian.shape[1] + 1]
     while True:
         step = bounded_levenberg_marquardt_step(reduced[:, :-1], reduced[:, -1], mu, low, high)
         if not np.linalg.norm(step) > longest:
