@@ -489,9 +489,9 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
         return "It is not known whether the model explains the recordings."
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
-        chance = "" if p_value is None else f", and at least this with a probability of {p_value:.2g}"
-        said = "It is not certain whether the model explains the recordings: their error is larger than noise, but not"
-        return f"{said} significantly ({size}{chance}). More data can decide this."
+        chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
+        said = "It is not certain whether the model explains the recordings, because noise may cause the error"
+        return f"{said} ({size}{chance}). More data can decide this."
     if explains:
         return f"The model explains the recordings to within their noise ({size})."
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."

@@ -12,6 +12,7 @@ from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, grouped, p_value_text, unseen_effects_sentence
+from yid_ocp.effects import EFFECTS
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -52,7 +53,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     gap, *others = result["summary"].split("\n")
     is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
     head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe
-    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:]
+    kinds = dict.fromkeys(own["kind"] for own in result.get("effects", ()) if own["kind"] in EFFECTS)
+    meant = " ".join(f"{kind}: {(EFFECTS[kind].__doc__ or '').partition(chr(10))[0]}" for kind in kinds)
+    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:], meant
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
     added = (f"+ {step['added']}" for step in steps)
@@ -78,9 +81,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    if any(entry["closure"] is not None for entry in result["which"]):
-        yield "Closure: part of the held-out error beyond noise that a candidate alone removes (–: not refitted alone)."
-    yield "Values without ± are forecasts of a linear model. p: probability that noise alone gives such a score."
+    order = "Refitted candidates come first, by held-out error. Closure alone: part of the held-out error beyond noise"
+    order += " that the candidate alone removes (–: not refitted). Values without ± are forecasts of a linear model."
+    yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
+    yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
@@ -95,7 +99,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
-        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
+        moved = "no information" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     yield SummaryTable(rows, "Since the baseline")
     rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]
@@ -123,13 +127,12 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
         for name, own in entry["parameters"].items():
-            unit = "" if own["unit"] == "1" else f" {own['unit']}"
-            if own["value"] is not None and own["std"] is not None:
-                values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
-            elif own["value"] is not None:
-                values.append(
-                    f"{name} = {round(own['value'], 12):.3g}{unit}" if entry["closure"] is None else f"{name} unknown"
-                )
+            unit, value = "" if own["unit"] == "1" else f" {own['unit']}", own["value"]
+            if value is not None and own["std"] is not None:
+                values.append(f"{name} = {value_and_uncertainty_text(value, own['std'], least_digits=3)}{unit}")
+            elif value is not None:
+                shown = f"= {round(value, 12):.3g}{unit}" if entry["closure"] is None else "unknown"
+                values.append(f"{name} {shown}")
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
@@ -353,7 +356,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not found:
-        yield "Use no value, because these recordings determine no parameter on which the methods could agree."
+        yield "Use no value, because these recordings determine no parameter."
     elif not result["agree"] and not result["disturbed"]:
         yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
 
@@ -362,7 +365,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
     entries = methods.values()
     yield "", *methods
     yield "status", *(entry["status"].replace("_", " ") for entry in entries)
-    yield "cost (whitened)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
+    yield "cost (in units of noise)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
     chi2 = "chi2 per degree of freedom (noise alone: 1)"
     yield chi2, *("unknown" if (x := e["fit"]["chi2_per_dof"]) is None else f"{x:.3g}" for e in entries)
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
@@ -380,7 +383,8 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "held-out error", "± standard error", f"minus that of {best}", "its ±", "unit", "note")]
+    columns = "law", "held-out error", "± standard error", f"difference from {best}", "± of difference", "unit", "note"
+    rows: TableRows = [columns]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")

@@ -220,8 +220,8 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
 def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str) -> Iterator[str]:
     found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
+        names = abbreviated_names_text(found)
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
-        text, names = f"{text} (near zero: of a typical value)", abbreviated_names_text(found)
         once = f", once you have checked the issues below ({mild})" if mild else ""
         yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
@@ -256,12 +256,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± if start and grasps were unknown", "± if all else were known")
+    unsure = ("± [of the value]", "± with initial state and grasps estimated too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = ("unknown" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
+        spread = ("∞" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -273,7 +273,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
     start = "No fit was made: at the initial values, " * is_initial
-    doubt = f" Only weakly determined (use the interval): {abbreviated_names_text(weak)}." * bool(weak)
+    doubt = f" Only weakly determined: {abbreviated_names_text(weak)}." * bool(weak)
     yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
     if (std := result.get("grasp_std")) is not None:
         told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
@@ -281,7 +281,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
-    meanings = {"unknown": "the ± has no upper end", "open": "any value is possible", "–": "no value is determined"}
+    meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
     yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
@@ -432,11 +432,13 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if severe:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
     elif is_advised:
-        ended = f"`solve` can run, but its estimates may be poor: read the {'issues' if mild else 'warnings'} below."
+        ended = (
+            f"`solve` can run, but its values may be wrong. First read the {'issues' if mild else 'warnings'} below."
+        )
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    same = f"Mass matrix, weight and inverse dynamics of {agreed} agree with those of the library Pinocchio."
+    same = f"The library Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}."
     yield same if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (median)")]
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
@@ -459,7 +461,6 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:

@@ -263,4 +263,4 @@ def _warn(warnings: list[str], when: str, remedy: str, rows: list[dict[str, Any]
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
     ]
     said = f"natural frequencies change by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}: {', '.join(moved)}"
-    warnings += [f"{said}. If these vibrations matter, set {remedy}"] if moved else []
+    warnings += [f"{said}. If your motions excite these vibrations, set {remedy}"] if moved else []

@@ -165,7 +165,7 @@ def propose_config_choices(
     for recording in recordings:
         start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
-            moving = f"{mover} already moves at the start of {recording.name}"
+            moving = f"{mover} already moves at the start of recording '{recording.name}'"
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -299,7 +299,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         return "driven", "torques move the arm, as errors of measured angles would cause false forces at the grasps"
     if seen:
         return "prescribed", f"the arm moves as measured, as it carries the object; also recorded: {seen}"
-    return "prescribed", "the arm moves as measured; the object is estimated from its efforts, the only other data"
+    return "prescribed", "the arm moves as measured, and its efforts show the object, because nothing else was measured"
 
 
 def _commanded(joints: JointGroup) -> bool:
@@ -427,7 +427,7 @@ def _near(
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
-        why = f"its largest distance from {holder} is {part:.1%} of the length"
+        why = f"it was at most {part:.1%} of the length away from {holder}"
         why += " (beyond the end, so check length, frame and clocks)" if part > 1.05 else ""
         return _along(branch.name, min(100, percent)), why
     local = poses[0, :3, :3].T @ from_holder[0]
