@@ -61,6 +61,7 @@ def diagnose(
     store: RefitStore = NO_REFIT_STORE,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
+    refit_solver: GaussNewton | None = None,
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: find out whether it exists, where it is, and what causes it.
 
@@ -85,6 +86,8 @@ def diagnose(
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
         them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
         the sought effects, which are predicted with the found effects removed.
+    refit_solver : GaussNewton, optional
+        Solver of all refits, for example with looser tolerances if model error dominates the cost.
 
     Returns
     -------
@@ -95,6 +98,7 @@ def diagnose(
         begun = time.perf_counter()
         problem, earlier = problem_with_priors_and_baseline(problem, baseline)
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
+        composed = replace(composed, refit_solver=refit_solver)
         deadline = begun + (thresholds.budget or math.inf)
         count = len(composed.problem.episodes)
         search = RefitContext(composed, thresholds, progress, store, deadline, count, stage_ends={"": begun})

@@ -181,7 +181,8 @@ def _refitted_families(
     # events are corrected and recordings truncated as in the diagnosis
     held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
-    composed = replace(composed, problem=problem_corrected_for_events(composed.problem, events))
+    corrected, solver = problem_corrected_for_events(composed.problem, events), search.problem.refit_solver
+    composed = replace(composed, problem=corrected, refit_solver=solver)
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_HELD_OUT_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)

@@ -31,6 +31,7 @@ from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
+from yid_ocp.solvers import GaussNewton
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 
@@ -142,6 +143,7 @@ class AllCandidatesProblem:
     is_split_in_blocks: bool  # whether alternate blocks of the estimation recordings are held out, without other ones
     # functions of the nominal system with some candidates, by their labels and the time step [s]
     functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
+    refit_solver: GaussNewton | None = None  # of all refits; default: that of `refit`
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
     # of screenings that share them, by point of the shape grid: changes of residual and, by unknown, Jacobian (n,)
     changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] = field(default_factory=dict)

@@ -29,7 +29,7 @@ from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import SolverResult
 
 _SECANT_STDS = 0.4  # half the length of secants, in stds of the unknowns: longer than the steps of a rough cost
-REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)  # good to a part of a std
+REFIT_SOLVER = GaussNewton(max_iterations=25).with_coarse_tolerances  # good to a part of a std
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
@@ -287,11 +287,11 @@ def _model(
 
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
     """One run from one start; its evaluation is not `ok` if the model cannot be rolled out."""
-    neutral = neutral_effect_parameter_values(effects)
+    neutral, solver = neutral_effect_parameter_values(effects), problem.refit_solver or REFIT_SOLVER
     own = problem.problem_with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
-        outcome = REFIT_SOLVER.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
+        outcome = solver.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
     if not own.has_process_noise and outcome.evaluation is not None:
@@ -311,7 +311,7 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         return moving.evaluate(x, derivatives, equilibrium_guesses)
 
     # with fixed torques, a run can stop with an effect and a redundant torque offset that block each other
-    again = _seen(problem, effects, REFIT_SOLVER.minimize_cost(moving, outcome.x, None, evaluate))
+    again = _seen(problem, effects, solver.minimize_cost(moving, outcome.x, None, evaluate))
     return min(found, again, key=lambda run: run[-1].cost)
 
 

@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
-from yid_ocp.diagnosis.refit import RefitStore, RefittedModel, StoredFit
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import torque_law_tables_csv
@@ -37,7 +37,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
 from yid_ocp.report.animation import AnimationData, ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME
-from yid_ocp.solvers import Solution, fit_problem
+from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow import prediction_outputs, run_history, run_inputs
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
@@ -87,6 +87,8 @@ def run_diagnose(
         earlier = EarlierRunsBaseline.from_run_estimates(runs, without)
         problem, _ = problem_with_priors_and_baseline(problem, earlier)
         nominal: Solution | None = None
+        stated = run.solver if isinstance(run.solver, GaussNewton) else REFIT_SOLVER
+        refit_solver = replace(stated.with_coarse_tolerances, max_iterations=REFIT_SOLVER.max_iterations)
         try:
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
@@ -101,6 +103,7 @@ def run_diagnose(
                 store=refits,
                 baseline=earlier,
                 exclude=run.diagnosis.excluded_candidates,
+                refit_solver=refit_solver,
             )
         except KeyboardInterrupt:
             if len(refits):
