@@ -66,7 +66,10 @@ def test_every_configuration_has_its_row(repository):
     assert set(configurations(repository)) == set(QUICK), "a new configuration needs a row in QUICK"
 
 
-@pytest.mark.parametrize("name", sorted(QUICK))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in ("deft_bdlo1", "so101_servo") else n for n in sorted(QUICK)],
+)
 def test_configuration_runs(carried_out, repository, name):
     settings = (*QUICK[name], "output.write_report=false")
     result = carried_out("solve", recorded(repository, name), settings=settings, codes=(0, 1)).result

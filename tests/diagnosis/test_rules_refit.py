@@ -30,8 +30,9 @@ LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
 CERTAIN = np.zeros((1, 1))
+UNKNOWN = SimpleNamespace(unknown_indices_affecting_recording=range)
 TWO_RECORDINGS = SimpleNamespace(
-    problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200))),
+    problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200)), unknowns=UNKNOWN),
     with_step_of_only_effects=lambda group: [effect.label for effect in group],
 )
 
@@ -43,7 +44,7 @@ class Problem:
         self.cost, self.rows, self.unknown_names = cost, rows, names
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
-        self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))
+        self.step, self.held_out_spread, self.refit_solver = SimpleNamespace(time_step=0.01), np.zeros((0, 0)), None
 
     @property
     def problem(self):
@@ -296,27 +297,22 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
         left = 9.0 - ord(effects[-1].kind)
         return fit(effects, loss(left, left))
 
-    def batched(function, entries, rollouts):
-        assert rollouts == 2  # of each refit: one per recording
+    def batched(function, entries, questions_per_item):
+        assert questions_per_item == 2  # of each refit: one per recording
         batches.append([of.kind for (of,), _ in entries])
         return [function(entry) for entry in entries]
 
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
-    search, march = (
-        RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0, n_recordings=2),
-        [["a"], ["b"], ["c"], ["d"]],
-    )
+    search, march = (RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b"], ["c"], ["d"]])
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
     assert refit_with_each_effect(search, (), tried[:1], {}) == []
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    assert (
-        len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_recordings=2), (), tried, {})) == 6
-    )
+    assert len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard()), (), tried, {})) == 6
     assert batches == [[*"abcdef"]]
 
 

@@ -310,8 +310,7 @@ def test_a_signature_explained_by_another():
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
     # nothing is like what moves nothing
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    found = overlaps(at)
-    np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(overlaps(at).overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
     assert overlaps(point([0.0])).labels == []
 
 

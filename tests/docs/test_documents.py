@@ -204,7 +204,7 @@ def test_the_methods_of_an_effect_that_the_page_names_exist(page):
             assert getattr(EFFECTS[kind], name) is not getattr(EffectBase, name)
 
 
-@pytest.mark.parametrize("name", ["first_steps", "lab_day"])
+@pytest.mark.parametrize("name", [pytest.param("first_steps", marks=pytest.mark.slow), "lab_day"])
 def test_the_notebook_runs_and_shows_what_it_was_made_with(repository, monkeypatch, name):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     path = [str(repository), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]

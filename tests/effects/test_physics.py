@@ -102,8 +102,7 @@ def test_a_standard_linear_solid_relaxes_with_its_time_constant() -> None:
 def test_hysteresis_loses_energy_and_saturates() -> None:
     system, stiffness, angle = link(), 1.5, 0.1
     effect = make_effect("hysteresis", "T1", system, {"stiffness": stiffness, "yield_angle": angle})
-    t = H * np.arange(801)
-    path = 0.6 * np.sin(2 * np.pi * 0.5 * t)[:, None]
+    path = 0.6 * np.sin(2 * np.pi * 0.5 * H * np.arange(801))[:, None]
     effort, _ = follow(system, [effect], path, dict(zip(effect.parameters.names, (stiffness, angle), strict=True)))
     nominal, _ = follow(system, [], path)
     friction = effort - nominal

@@ -79,7 +79,7 @@ def assert_same(one, other, tolerance=0.0):
         np.testing.assert_allclose(first, second, rtol=0, atol=tolerance * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["closed_loop", "relaxing_cable"])
+@pytest.mark.parametrize("name", ["closed_loop", pytest.param("relaxing_cable", marks=pytest.mark.slow)])
 def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name):
     case = parts.builders[name](urdf_folder)
     members = members_of(case)

@@ -192,8 +192,7 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
             along = step.kernel.step_residuals_and_jacobians(
                 theta, rollout.state, rollout.multipliers, rollout.torque, names, True
             )
-            found = [getattr(rollout, name) for name in GIVEN]
-            return *found, *vars(back).values(), *vars(along).values()
+            return *[getattr(rollout, name) for name in GIVEN], *vars(back).values(), *vars(along).values()
 
         return run
 

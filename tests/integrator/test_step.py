@@ -106,8 +106,7 @@ def test_a_compliance_equals_a_spring(parts, roll):
     states = []
     for system in (plain, soft):
         theta = system.parameters.vector({"C.damping": 0.0})
-        rollout = roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200)
-        states.append(rollout.state.copy())
+        states.append(roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200).state.copy())
     states[1][:, 9 + index] /= 0.5
     np.testing.assert_allclose(states[1], states[0], rtol=0, atol=1e-8)
 

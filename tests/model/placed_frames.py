@@ -12,8 +12,7 @@ def numbers(expression, parameters=None) -> np.ndarray:
     """The value of an expression, at nominal parameters where it has any."""
     if parameters is None:
         return np.array(ca.DM(ca.densify(expression)))
-    function = ca.Function("numbers", [parameters.symbols], [expression])
-    return np.array(ca.densify(function(parameters.vector())))
+    return np.array(ca.densify(ca.Function("numbers", [parameters.symbols], [expression])(parameters.vector())))
 
 
 def positions(item, frames, q=None):

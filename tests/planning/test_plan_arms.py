@@ -61,6 +61,7 @@ def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
     assert kept.output.point_trajectories["cable:50%"][:, 2].max() < lid + 2e-4
 
 
+@pytest.mark.slow
 def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
     path = (
         "goal=path",

@@ -100,19 +100,17 @@ def two_arms(paper_systems, clean):
     return EstimationProblem(step, [recording], FREE, ProblemOptions(duration=2.0))
 
 
+@pytest.mark.slow
 def test_equilibria_of_nodes_far_apart_keep_the_shape_of_a_soft_object(two_arms):
     whole = EstimationProblem(two_arms.step, [two_arms.episodes[0].recording], FREE)
     solution = fit_problem(whole, CONDENSED, restarts=False)
     assert solution.status == Status.CONVERGED, solution.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
-    [
-        CONDENSED,
-        pytest.param(MultipleShooting(condensing=True, node_interval=10), marks=pytest.mark.slow),
-        pytest.param(MultipleShooting(), marks=pytest.mark.slow),
-    ],
+    [CONDENSED, MultipleShooting(condensing=True, node_interval=10), MultipleShooting()],
     ids=["node every 20 steps", "node every 10 steps", "node every step"],
 )
 def test_fifty_variables_from_far_away(two_arms, solver):

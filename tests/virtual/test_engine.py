@@ -290,7 +290,7 @@ def test_experiments_that_do_not_fit_are_refused() -> None:
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 
 
-@pytest.mark.parametrize(("kind", "arms"), [("ROUGH", 1), ("CLEAN", 2)])
+@pytest.mark.parametrize(("kind", "arms"), [("ROUGH", 1), pytest.param("CLEAN", 2, marks=pytest.mark.slow)])
 def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmark_module) -> None:
     made = benchmark_module("make_recordings")
     torques, system = getattr(made, kind), SYSTEMS[arms]

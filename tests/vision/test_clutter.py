@@ -31,6 +31,7 @@ def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction
     assert np.mean(np.abs(error / found.std)[np.isfinite(error)] < 2) > 0.9
 
 
+@pytest.mark.slow
 def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):
     """A background of frames or of an empty scene, and its mesh."""
     table = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])

@@ -138,7 +138,7 @@ def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
     assert np.array_equal(one.std, other.std)
 
 
-@pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
+@pytest.mark.parametrize("name", ["track_single_arm", pytest.param("track_dual_arm", marks=pytest.mark.slow)])
 def test_the_examples_run(carried_out, repository, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"

@@ -60,6 +60,7 @@ def test_a_wrong_length_is_said_and_its_point_is_not_written(track, factor, valu
     assert np.nanmax(np.abs(error)) < 0.006
 
 
+@pytest.mark.slow
 def test_a_wrong_length_further_up_moves_everything_and_is_found(track):
     longer = {"T1": 1.1 * Y_LENGTHS["T1"]}
     found, error = track(longer, frames=3, filters=COARSE, estimated_dimensions=("length",))

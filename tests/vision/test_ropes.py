@@ -194,6 +194,7 @@ def test_a_robot_says_where_the_root_is(rope):
         track_object(SceneDescription(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
 
 
+@pytest.mark.slow
 def test_the_command_needs_no_recording(tmp_path, capsys):
     lines = [snake(k) for k in range(2)]
     vision.write_frame_folder(film(lines, TABLE), tmp_path / "frames")

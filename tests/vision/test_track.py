@@ -37,6 +37,7 @@ def test_points_at_two_metres(clean):
     assert clean.track.std.max() < 20 * MILLIMETRE
 
 
+@pytest.mark.slow
 def test_a_third_of_the_frames_lost_a_fifth_of_the_points_wrong_and_stamps_late(tracked):
     hard = tracked(outliers=0.2, dropped_frame_fraction=1 / 3, seed=11, latency_std=0.003, late=(2, 5))
     assert np.isfinite(hard.errors).mean() > 0.9

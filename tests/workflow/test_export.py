@@ -66,6 +66,7 @@ def gate_holds(gate) -> None:
     assert arm["before"] > 4 * arm["noise"]
 
 
+@pytest.mark.slow
 def test_the_embedded_diagnosis_in_mujoco(printed, found, tmp_path) -> None:
     out = tmp_path / "y.xml"
     told = printed("export", found, "--out", out)

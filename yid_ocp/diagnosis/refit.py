@@ -136,7 +136,6 @@ class RefitContext:
     progress: Progress
     store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
-    n_recordings: int = 1  # to which each refit fits; they are simulated together
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
@@ -398,12 +397,11 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
-    layout, batch = (
-        search.problem.problem.unknowns,
-        partial(map_with_merged_calls, questions_per_item=search.n_recordings),
-    )
-    is_wide = len(layout.free_parameter_names) + len(layout.initial_state_names) > MAX_BATCHED_COLUMNS
-    at_once = map_in_threads if is_wide else batch  # waiting fits would keep their memory
+    problem = search.problem.problem
+    columns = len(problem.unknowns.unknown_indices_affecting_recording(0))
+    merged = partial(map_with_merged_calls, questions_per_item=len(problem.episodes))
+    # no batch would have so many columns, and waiting fits would keep their memory
+    at_once = map_in_threads if columns > MAX_BATCHED_COLUMNS else merged
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break

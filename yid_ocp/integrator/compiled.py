@@ -37,8 +37,7 @@ from yid_ocp.parallel import CasadiLockedCache, call_merged_with_other_threads, 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch of any size, in rollouts of one member, and the extra cost per sensitivity column."""
 _MIN_BATCH_SPEEDUP = 1.5  # minimum speed-up of a batch over single rollouts; above 2 it is also faster than two threads
-MAX_BATCHED_COLUMNS = int((8 / _MIN_BATCH_SPEEDUP - _BATCH_COST) / _BATCH_COST_PER_COLUMN)
-"""Largest number of sensitivity columns with which a full batch is faster than single rollouts."""
+MAX_BATCHED_COLUMNS = int((8 / _MIN_BATCH_SPEEDUP - _BATCH_COST) / _BATCH_COST_PER_COLUMN)  # of a useful batch
 MIN_STEPS_TO_COMPILE_BATCH = 50_000  # that could have been batched, after which the batched kernel is compiled
 
 

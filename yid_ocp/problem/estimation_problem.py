@@ -243,8 +243,8 @@ class EstimationProblem(ReprMixin):
             cost += part.cost
             residuals.append(part.residual)
             if jacobian is not None and part.jacobian is not None:
-                own = layout.slice_of_recording(i)
-                jacobian[own, self.unknowns.unknown_indices_affecting_recording(i)] = part.jacobian
+                rows, columns = layout.measurements[i], self.unknowns.unknown_indices_affecting_recording(i)
+                jacobian[rows[0].start : rows[-1].stop, columns] = part.jacobian
             # derivatives are the largest arrays
             done.append(replace(result, output_sensitivities=None, torque_correction_sensitivity=None))
         residual = np.concatenate([*residuals, prior])

@@ -61,10 +61,6 @@ class ResidualVectorLayout:
         """The slice of the residual vector that holds data and stated priors."""
         return slice(0, self.stated_priors.stop)
 
-    def slice_of_recording(self, recording: int) -> slice:
-        """Return the slice of the residual vector that holds the measurements of one recording."""
-        return slice(self.measurements[recording][0].start, self.measurements[recording][-1].stop)
-
     @staticmethod
     def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualVectorLayout:
         """Build the layout from the episodes and the numbers of stated and weak prior residuals."""

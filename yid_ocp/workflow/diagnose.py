@@ -88,7 +88,6 @@ def run_diagnose(
         problem, _ = problem_with_priors_and_baseline(problem, earlier)
         nominal: Solution | None = None
         stated = run.solver if isinstance(run.solver, GaussNewton) else REFIT_SOLVER
-        refit_solver = replace(stated.with_coarse_tolerances, max_iterations=REFIT_SOLVER.max_iterations)
         try:
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
@@ -103,7 +102,7 @@ def run_diagnose(
                 store=refits,
                 baseline=earlier,
                 exclude=run.diagnosis.excluded_candidates,
-                refit_solver=refit_solver,
+                refit_solver=replace(stated.with_coarse_tolerances, max_iterations=REFIT_SOLVER.max_iterations),
             )
         except KeyboardInterrupt:
             if len(refits):
