@@ -105,8 +105,7 @@ def variadic_tuple_entry_type(hint: Any) -> Any:
 
 def literal_choices(hint: Any) -> list[str]:
     """Return the words that a type allows, if it is a `Literal` or a union with one."""
-    found = (split_annotated(member)[0] for member in non_none_union_members(hint))
-    return [str(word) for bare in found if get_origin(bare) is Literal for word in get_args(bare)]
+    return [str(word) for own in non_none_union_members(hint) if get_origin(own) is Literal for word in get_args(own)]
 
 
 def describe_type(hint: Any) -> str:

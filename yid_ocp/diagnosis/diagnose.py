@@ -47,6 +47,7 @@ _LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
+_NEGLIGIBLE_MOVE_IN_STDS = 0.1  # largest change of an estimate that does not change which events are found
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
 
@@ -316,9 +317,12 @@ def _without_events(
         less = replace(first, problem=problem_corrected_for_events(first.problem, events))
         search.progress.begin_stage("fitting the nominal model without the events that were found", 3.0, 11.5)
         search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
-        nominal, before = _fitted_nominal_model(search, nominal.values, name), events
-        # the smoother's result includes the events
-        events, smoothed = find_events(whole, nominal, search.thresholds)[0], None
+        smoothed, (old, before) = None, (nominal, events)  # the smoother's result includes the events
+        nominal = _fitted_nominal_model(search, old.values, name)
+        moved = (abs(nominal.values[own] - old.values[own]) / max(std, 1e-300) for own, std in nominal.std.items())
+        if max(moved, default=0.0) < _NEGLIGIBLE_MOVE_IN_STDS:  # the same events would be found again
+            break
+        events, _ = find_events(whole, nominal, search.thresholds)
         if events.has_same_force_and_fault_events(before):
             break
     return search, nominal, events, None if first.is_split_in_blocks else smoothed

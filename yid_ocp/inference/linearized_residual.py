@@ -153,8 +153,7 @@ def residual_and_jacobian_with_stated_priors(problem: EstimationProblem, evaluat
     residual, jacobian = evaluation.residual[kept], evaluation.jacobian[kept]
     if noise == 1.0:  # no copy, which may be large
         return residual, jacobian
-    units = np.ones(len(residual))
-    units[problem.residual_rows.data] = noise
+    units = np.where(np.arange(len(residual)) < problem.residual_rows.data.stop, noise, 1.0)
     return residual / units, jacobian / units[:, None]
 
 

@@ -228,10 +228,7 @@ class EpisodePredictor:
     def predict_episodes(
         self, queries: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> Iterator[EpisodePrediction | str]:
-        """Predict episodes one after the other, each given as (episode, theta, offset, guess).
-
-        A failure gives an error message. Few episodes are predicted at once, because derivatives need much memory.
-        """
+        """Predict episodes, given as (episode, theta, offset, guess), a few at once. A failure gives a message."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
