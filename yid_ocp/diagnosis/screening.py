@@ -117,6 +117,7 @@ def linearize_candidates(
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large
         places = [trial.unknown_names.index(name) for name in amplitudes]
+        others = [name for name in trial.unknown_names if name not in amplitudes]
         basis, follow = orthonormal_basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
         residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
@@ -127,13 +128,13 @@ def linearize_candidates(
         errors, shifts = [], []
         for (_, first), (error, own) in zip(known[0], known[point], strict=False):
             changes, unmoved = first | own, np.zeros_like(error)
-            change = np.stack([changes.get(name, unmoved) for name in trial.unknown_names], axis=1)
+            by_own, by_others = (np.stack([changes.get(n, unmoved) for n in part], 1) for part in (amplitudes, others))
             # the part of a signature that free parameters explain changes with their own signatures
             shift = np.zeros_like(moved)
-            shift[rows.data] = change[:, places] - np.delete(change, places, axis=1) @ follow
-            shifts.append(shift - basis @ (basis.T @ shift))
+            shift[rows.data] = by_own - by_others @ follow
+            shift -= basis @ (basis.T @ shift)
+            shifts.append(shift)
             errors.append(error)
-        others = [name for name in trial.unknown_names if name not in amplitudes]
         by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
         split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_base, *shifts))
         for (effect, shape), (columns, changes, *shifted) in zip(chosen, zip(*split, strict=True), strict=True):
@@ -158,7 +159,8 @@ def _changes(
         return None
     other, slopes = residual_and_jacobian_with_stated_priors(again, outcome)
     at = [again.unknown_names.index(name) for name in names]
-    return (other - data)[rows], dict(zip(names, (slopes[rows][:, at] - jacobian[rows][:, at]).T, strict=True))
+    changes = np.subtract(slopes[rows][:, at], jacobian[rows][:, at], dtype=np.float32)  # of many columns
+    return (other - data)[rows], dict(zip(names, changes.T, strict=True))
 
 
 def _detectability(signature: _EffectSignature) -> CandidateDetectability:
