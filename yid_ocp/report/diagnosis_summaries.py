@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, grouped, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, p_value_text, unseen_effects_sentence
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -80,14 +80,13 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     if any(entry["closure"] is not None for entry in result["which"]):
         yield "Closure: part of the held-out error beyond noise that a candidate alone removes (–: not refitted alone)."
-    yield "Values without ± are forecasts of a linear model. p: probability that noise alone gives such a score."
+    text = "Values without ± are forecasts of a linear model. p: probability that noise alone gives such a score."
+    yield f"{text} Candidates that were not refitted are in the order of p." if result["which"] else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
-    rows = [
-        ("effect", "places"),
-        *((k, ", ".join(own)) for k, own in grouped(label.partition("@")[::2] for label in unseen).items()),
-    ]
+    places = grouped(label.partition("@")[::2] for label in unseen)
+    rows = [("effect", "places"), *((kind, ", ".join(own)) for kind, own in places.items())]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
@@ -124,12 +123,12 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         values = []
         for name, own in entry["parameters"].items():
             unit = "" if own["unit"] == "1" else f" {own['unit']}"
+            text = f"{name} unknown"
             if own["value"] is not None and own["std"] is not None:
-                values.append(f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}")
-            elif own["value"] is not None:
-                values.append(
-                    f"{name} = {round(own['value'], 12):.3g}{unit}" if entry["closure"] is None else f"{name} unknown"
-                )
+                text = f"{name} = {value_and_uncertainty_text(own['value'], own['std'], least_digits=3)}{unit}"
+            elif entry["closure"] is None and own["value"] is not None:
+                text = f"{name} = {round(own['value'], 12):.3g}{unit}"
+            values += [text] if own["value"] is not None else []
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
@@ -253,25 +252,26 @@ def _rate(own: Mapping[str, Any]) -> str:
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
-    found = grouped(own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
+    told = (own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
+    found = grouped(((name, own["unit"]), own) for name, own in told)  # runs of other models may have other units
     names = sorted(found, key=lambda name: -len(found[name]))
-    units = {name: found[name][-1]["unit"] for name in names}
-    heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
+    heads = [(key, f"{key[0]} [{key[1]}]" if key[1] else key[0]) for key in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
-    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
-    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
-    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
+    ends = [entry["status"].replace("error", "stopped by an error").replace("_", " ") for entry in runs]
+    said = [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
+    failed = ((end, run) for end, run in zip(ends, runs, strict=True) if not run["ok"])
+    said += [f"{run['name']}: {end}: {run['message'].splitlines()[0].removesuffix('.')}." for end, run in failed]
     alike = result["history"]
     said += [] if alike is None else _history_sentences(alike)
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
-    for name in names:
-        values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
+    for (name, unit), entries in found.items():
+        values = [own["value"] for own in entries if own["verdict"] in _FOUND_VERDICTS]
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
-            spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
+            spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), unit))
     yield SummaryTable(spread, "Parameters over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
@@ -279,12 +279,13 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from () if alike is None else _consistency_blocks(alike)
 
 
-def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
+def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str], str]) -> Iterator[Sequence[str]]:
     yield "run", "status", "chi2/n (noise alone: 1)", "effects", *heads.values(), "time"
     for entry in runs:
         cells = []
-        for own in (entry["parameters"].get(name, {"value": None}) for name in heads):
-            if own["value"] is None:
+        for name, unit in heads:
+            own = entry["parameters"].get(name, {"value": None})
+            if own["value"] is None or own["unit"] != unit:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
                 cells.append(value_and_uncertainty_text(own["value"], own["std"], None))
@@ -539,7 +540,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
+    yield SummaryTable(rows) if gate["channels"] else "The file is untested: MuJoCo replays no recorded channel."
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):

@@ -317,7 +317,8 @@ def _replayed(
 ) -> dict[str, ReplayErrorAgainstRecording]:
     found: dict[str, list[ReplayErrorAgainstRecording]] = {}
     for i, recording in enumerate(recordings):
-        progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
+        own = f"{recording.name}{' as exported' * round_}"
+        progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), own)
         for name, error in replay_mismatch_by_channel(text, system, recording).items():
             found.setdefault(name, []).append(error)
     together = {}
