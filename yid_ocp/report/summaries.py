@@ -468,7 +468,6 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Frequencies by {head}")
     yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:
@@ -476,6 +475,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
+    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] else {})
 
