@@ -144,14 +144,15 @@ def check_option_bounds(options: Any, where: str) -> None:
         value = getattr(options, option.field_name)
         if not _within(option.type_hint, value):
             what, allowed = f"{name} is {value}, which is out of range", describe_type(option.type_hint)
-            raise ConfigError(what, where=where, allowed=allowed, hint=default_value_hint(name, option.default_value))
+            raise ConfigError(what, where=where, allowed=allowed, hint=default_value_hint(name, option))
 
 
-def default_value_hint(key: str, default: Any) -> str:
+def default_value_hint(key: str, option: Option) -> str:
     """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
+    default, allowed = option.default_value, describe_type(option.type_hint)
     if isinstance(default, (int, float, str)):
         return f"set {key} to an allowed value, such as {default}"
-    return f"write {key} in the allowed form" + ", or leave it out" * (default is not MISSING)
+    return f"write {key} as {allowed}" + ", or leave it out" * (default is not MISSING)
 
 
 def _within(hint: Any, value: Any) -> bool:

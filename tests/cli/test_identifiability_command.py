@@ -183,7 +183,7 @@ def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
         return done(problem, solution, **more)
 
     monkeypatch.setattr(fisher, "identifiability", failing)
-    words = r"2 of 2 tasks failed; the first failure is that of spring_1.stiffness, SolverError: no s(.|\n)*mend it"
+    words = r"2 of 2 tasks failed; the first failure is that of spring_1.stiffness: no s(.|\n)*mend it"
     with pytest.raises(ParallelWorkError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
 

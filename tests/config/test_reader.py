@@ -17,7 +17,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
-RENAMED = "new names of older ones are in the table of CHANGELOG.md"
+RENAMED = "CHANGELOG.md of the project has the new names of older ones"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):

@@ -245,8 +245,9 @@ def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is()
 
 
 def test_few_samples_of_the_joints_are_serious_and_few_frames_beside_them_are_not():
-    for until, said in ((0.02, [("joints", "not_trusted")]), (0.6, [("points_camera", "warning")])):
-        issues = recording_quality_issues(made().time_slice(0.0, until), lambda _: SensorOptions())
+    few, serious = [("points_camera", "warning")], [("joints", "not_trusted")]
+    for until, span, said in ((0.02, np.inf, serious), (0.6, np.inf, few), (9.0, 0.6, few), (9.0, 9.0, [])):
+        issues = recording_quality_issues(made().time_slice(0.0, until), lambda _: SensorOptions(), span)
         assert [(own.group, own.severity) for own in issues if own.cause == "few_samples"] == said
 
 

@@ -132,6 +132,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no measurements", ""),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
+    "meaning of times": (GOOD, {"column_meanings": {"t": "time"}}, "meaning 'time' of column", "'t=t'"),
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:a'"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),

@@ -74,10 +74,10 @@ def gaps():
     ]:  # fmt: skip
         tests = {"nominal_test": outcome(p[0], chi2=1.123), "nominal_held_out_test": outcome(p[1], chi2=2.345)}
         yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
-    few = {"nominal_test": outcome(degrees=11.6), "nominal_model": fit(values=dict.fromkeys("abcde", 1.0))}
-    for seen in ((), (True,), (True, False)):
+    for degrees, seen in ((11.6, ()), (11.6, (False,)), (4.6, (True, False))):
+        few = {"nominal_test": outcome(degrees=degrees), "nominal_model": fit(values=dict.fromkeys("abcde", 1.0))}
         hidden = {"screening": screening(seen=[visible(FRICTION, own) for own in seen])}
-        yield f"insufficient data, {seen}", finding("insufficient_data", **few, **hidden, **NO_EFFECT)
+        yield f"insufficient data, {degrees} {seen}", finding("insufficient_data", **few, **hidden, **NO_EFFECT)
     for p, size in ((1e-9, 1.05), (1e-3, 1.15), (0.006, 1.15)):
         tests = {"nominal_test": outcome(p, chi2=size), "nominal_held_out_test": outcome(0.5, chi2=0.99)}
         seen = {"screening": screening([score(FRICTION, p=1e-6 if size < 1.1 else 1e-3)])}

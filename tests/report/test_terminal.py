@@ -105,9 +105,9 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", lost)
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "from", "0"]
     assert "±" not in "".join(lines[lines.index("") + 2 :])
-    said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD)))
-    parts = "the fit did not converge", "limit after 4 iterations in all", "do not determine", "does not explain"
-    assert [part in said for part in parts] == [True, True, False, False]
+    said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
+    parts = "the fit did not converge", "limit after 4 iterations in all", "2e+03 times the chi2 of noise, first"
+    assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
     assert lines[0].startswith("Do not use the values, because the fit failed: step 3. If a simulation failed, ")
@@ -222,10 +222,10 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():
-    done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5}
+    done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5, "message": "It is short."}
     failed, good = (told("yid-simulate/1", own)[0] for own in ({"status": "failed", "message": "step 3"}, done))
     assert failed.startswith("The simulation failed: step 3. If ")
-    assert good.startswith("The file recording.h5 has 0.5 s of simula")
+    assert good == "The file recording.h5 has 0.5 s of simulated motion. It is short."
 
 
 def test_blocks_on_a_terminal():

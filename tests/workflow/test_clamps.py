@@ -146,7 +146,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
     ("change", "words"),
     [
         ({"format": "yid-plan/1"}, "another command"),
-        ({"format": "yid-diagnosis/1"}, "table of CHANGELOG.md"),
+        ({"format": "yid-diagnosis/1"}, "CHANGELOG.md of the project"),
         ({"status": "failed", "message": "no"}, "the run in this folder failed: no"),
         ({"covariance": {}}, "the key .names. is missing"),
         ({"covariance": {"names": [], "matrix": []}}, "the run has found no parameter"),

@@ -439,6 +439,9 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.Ca
     (bench / "bag.csv").write_text("\n".join(columns) + "\n")
     flags = ["--columns", "r=position:roll,p=position:pitch,ax=x:tip,ay=y:tip,az=z:tip", "--units", "deg,mm"]
     assert init(*CABLE, *flags, "--points", "tip=cable:100%", files=["bag.csv"]) == 0
+    assert main(["init", "wrist.urdf", "bag.csv", *CABLE, *flags, "--out", "new.yaml"]) == 2
+    told = capsys.readouterr()
+    assert ("run.yaml, recording: bag.h5" in told.out, "give bag.h5 as the recording" in told.err) == (True, True)
     run = load_config("run.yaml")
     made = read_recording(run.recordings.estimate[0])
     assert np.allclose(made.joints.position, recording.joints.position)
@@ -504,7 +507,7 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     assert "the robot has no joint that can move" in refusal("one.h5", robot="package:quadrotor_base")
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
     told = refusal("bag.csv")
-    assert re.search("(?s)none of the recorded joints is a joint of the robot: shoulder.*--joints shoulder=roll", told)
+    assert re.search("(?s)none of the recorded joints is a joint of the robot: shoulder.*--joints shoulder=NAME", told)
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
     assert "the recording lacks the joint 'pitch', which one has" in refusal("one.h5", "bag.csv")

@@ -276,7 +276,8 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
     told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
     assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
-    assert "without the error of the time step" in next(copyable_estimates_blocks({"to_use": rough}))
+    lacking = "without the error of the time step; left out as too uncertain: T1.twist)"
+    assert lacking in next(copyable_estimates_blocks({"to_use": rough}))
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; for n links, multiply by n/4 -->']

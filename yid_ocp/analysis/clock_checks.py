@@ -349,7 +349,8 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         leaves = f"the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit} after the fit"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
-        advice = "the large std makes every ± too wide and hides small gaps. State the std of the actual noise"
+        advice = "the large std makes every ± too wide, hides small gaps and can end the fit before its error is "
+        advice += "smallest. Until this issue is gone, fit again with a smaller std"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         where = group.partition(".")[0]
         yield Issue("noise_overstated", f"{leaves}, {times}", "warning", severity, advice, "", where, setting=setting)

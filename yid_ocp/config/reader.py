@@ -305,9 +305,8 @@ class _Reader:
         return kind(**values)
 
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath, default: Any) -> ConfigError:
-        markers = options.split_annotated(hint)[1]
-        unit = next((entry.unit for entry in markers if isinstance(entry, options.OptionInfo) and entry.unit), "")
-        advice = options.default_value_hint(self._name(path), default)
+        unit = schema.option_info_from_annotation(hint).unit
+        advice = options.default_value_hint(self._name(path), options.Option(hint, default))
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
             advice = f"write the number alone, in {unit}" if unit else "write the number alone"
             if unit and match[2].strip() != unit:
@@ -316,7 +315,7 @@ class _Reader:
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
         if isinstance(raw, str):
             advice = nearest_name_question(raw, options.literal_choices(hint)) or advice
-        shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and "," not in unit else _shown(raw)
+        shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and not {*",'"} & {*unit} else _shown(raw)
         what = f"{self._name(path)} is {shown}, which is not allowed"
         return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
 

@@ -14,7 +14,7 @@ from yid_ocp import options
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 
-RENAMED_NAMES_HINT = "new names of older ones are in the table of CHANGELOG.md"
+RENAMED_NAMES_HINT = "CHANGELOG.md of the project has the new names of older ones"
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class SectionVariants:
             what = f"the key '{self.selector_key}' is missing"
             hint = f"add {self.selector_key}: {next(iter(self.classes))}"
             return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
-        what, known = f"there is no {self.variant_noun} '{word}'", unknown_name_error_arguments(str(word), self.classes)
-        return ConfigError(what, where=where, allowed=known["allowed"], hint=f"{known['hint']}; {RENAMED_NAMES_HINT}")
+        what, otherwise = f"there is no {self.variant_noun} '{word}'", f"use an allowed name; {RENAMED_NAMES_HINT}"
+        return ConfigError(what, where=where, **unknown_name_error_arguments(str(word), self.classes, otherwise))
 
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:

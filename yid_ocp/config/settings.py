@@ -258,11 +258,11 @@ class ImportSettings:
 class ParameterSettings:
     """The initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
-    initial: Annotated[float | None, OptionInfo("value; initial value if free", "that of the parameter")] = None
-    bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
+    initial: Annotated[float | None, OptionInfo("value; initial value if free", "the parameter's unit")] = None
+    bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "the parameter's unit")] = None
     free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
     prior_std: Annotated[
-        float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "that of the parameter")
+        float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "the parameter's unit")
     ] = None
     per_recording: Annotated[bool | None, OptionInfo("whether it has a separate value in every recording")] = None
 

@@ -64,7 +64,10 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     kept = []
     for begin, end in edges:
         part = None if t[end] - t[begin] < _MIN_PART_DURATION else recording.time_slice(float(t[begin]), float(t[end]))
-        if part is not None and (begin == 0 or anywhere or _begins_at_rest(part)):
+        if part is None:
+            continue
+        first = None if part.joints is None else part.joints.position[part.joints.t <= part.joints.t[0] + 0.2]
+        if begin == 0 or anywhere or (first is not None and np.ptp(first, axis=0).max() < _MAX_ROTATION_AT_REST):
             kept.append(part)
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
@@ -83,12 +86,6 @@ def _times(recording: Recording, driving: Sequence[str]) -> Array:
         if columns := [group.names.index(name) for name in driving if name in group.names]:
             return group.t[np.isfinite(group.position[:, columns]).all(axis=(1, 2))]
     return recording.points[0].t
-
-
-def _begins_at_rest(recording: Recording) -> bool:
-    if (joints := recording.joints) is None:
-        return False
-    return bool(np.ptp(joints.position[joints.t <= joints.t[0] + 0.2], axis=0).max() < _MAX_ROTATION_AT_REST)
 
 
 def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) -> Issue:
@@ -111,8 +108,8 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
-def recording_quality_issues(recording: Recording, options: SensorOptionsFunction) -> list[Issue]:
-    """Return the issues of one recording that need no model. `options`(key): those of a sensor (`joints.effort`)."""
+def recording_quality_issues(recording: Recording, options: SensorOptionsFunction, span: float = np.inf) -> list[Issue]:
+    """Return the issues of one recording that need no model. `options`(key): of a sensor. `span`: used seconds."""
     recording = recording.with_effort_sampling_kind(options("joints.effort").effort_sampling_kind)
     # if times are not seconds, only the number of samples can be checked
     found = list(_units_of_time(recording)) or chain(
@@ -125,7 +122,7 @@ def recording_quality_issues(recording: Recording, options: SensorOptionsFunctio
         channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )
-    return [replace(issue, recording=recording.name) for issue in chain(_few_samples(recording), found)]
+    return [replace(issue, recording=recording.name) for issue in chain(_few_samples(recording, span), found)]
 
 
 def _units_of_time(recording: Recording) -> Iterator[Issue]:
@@ -144,16 +141,17 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
 
-def _few_samples(recording: Recording) -> Iterator[Issue]:
+def _few_samples(recording: Recording, span: float) -> Iterator[Issue]:
     groups, least = recording.joint_and_point_groups, QUALITY_LIMITS.min_samples
-    for group in groups:
-        count = len(group.t)
+    counts = [int(np.sum(group.t - group.t[0] <= span)) for group in groups]
+    for group, count in zip(groups, counts, strict=True):
         if count < least:
             # angles between so few samples are unknown; a few frames beside a dense group still tell something
-            is_serious = group is recording.joints or all(len(own.t) < least for own in groups)
-            what = f"{group.name} has only {count_with_noun(count, 'sample')} (at least {least} are needed)"
+            is_serious = group is recording.joints or max(counts) < least
+            first = f" in the first {span:g} s" * (count < len(group.t))
+            what = f"{group.name} has only {count_with_noun(count, 'sample')}{first} (at least {least} are needed)"
             severity: IssueSeverity = "not_trusted" if is_serious else "warning"
-            advice = "check whether the file is complete. If it is, record longer"
+            advice = "check whether the file is complete and problem.duration (if set) long enough; else record longer"
             yield Issue("few_samples", what, severity, least / count, advice, "", group.name)
 
 

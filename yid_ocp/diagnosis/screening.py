@@ -132,8 +132,7 @@ def linearize_candidates(
             # the part of a signature that free parameters explain changes with their own signatures
             shift = np.zeros_like(moved)
             shift[rows.data] = by_own - by_others @ follow
-            shift -= basis @ (basis.T @ shift)
-            shifts.append(shift)
+            shifts.append(shift - basis @ (basis.T @ shift))
             errors.append(error)
         by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
         split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_base, *shifts))

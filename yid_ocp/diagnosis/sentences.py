@@ -91,12 +91,10 @@ def _lead(result: DiagnosisResult) -> str:
     large = f"The nominal model has an error beyond noise (a gap){only}: {sizes} {chance}."
     small = f"In total the error of the nominal model is within noise: {sizes}. "
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
-    exceeds = null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria)
-    gap = _said((exceeds, large), (True, small))[0]
+    gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
-    shown = f"would show {sum(seen)} of {len(seen)} effects"
-    degrees = tests[0].degrees_of_freedom
-    few = f"{degrees:.0f} independent samples (more than {unknowns}, the number of unknowns, are needed)"
+    shown = f"would reveal {sum(seen)} of {len(seen)} effects if they existed"
+    few = f"{tests[0].degrees_of_freedom:.0f} independent samples (more than {unknowns}, one per unknown, are needed)"
     beyond = ", but expect errors beyond noise" * (result.remaining_test.p_value < limits.significance_level)
     names = listed([effect.label for effect in result.accepted_effects])
     causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
@@ -131,9 +129,9 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
     (best, along), least = _best_candidate(result), 1 + limits.min_excess_chi2_per_dof
     is_significant = min(test.p_value for test in tests) < limits.significance_level
-    small = "The error is significantly larger than noise, but too small to count as a gap."
+    small = "The error is significantly larger than noise, but does not count as a gap."
     level = f"p below {limits.gap_significance_level / len(tests):.2g}"
-    needs = f"A gap needs chi2 per degree of freedom above {least:.4g} and {level}."
+    needs = f"A gap needs both chi2 per degree of freedom above {least:.4g} and {level}."
     seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
@@ -170,12 +168,11 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     unknown = f"{removed} an unknown part {of}"
     is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
     closed = _said(
-        (not added, ""),
-        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
-        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
-        (True, f"{unknown}."),
-    )[0]
-    lines = [gap_locations_sentence(result, has_origin=True), *_said((closed, closed))]
+        (added and math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
+        (added and is_within, f"{unknown}, because the nominal model's error there is within noise."),
+        (added, f"{unknown}."),
+    )[:1]
+    lines = [gap_locations_sentence(result, has_origin=True), *closed]
     lines += [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
     for own, *others in _rivals(result):
         tested = [label for label in others if label not in result.untried]

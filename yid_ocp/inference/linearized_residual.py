@@ -172,8 +172,7 @@ def orthonormal_basis_and_coefficients(matrix: Array, columns: Array) -> tuple[A
 
 def triangular_factor(jacobian: Array, residual: Array) -> Array:
     """Return R (n + 1, n + 1) with |J d + r| = |R (d, 1)| for all d (n,), for J and r of any number of rows."""
-    count = jacobian.shape[1] + 1
-    factor = np.zeros((count, count))
+    factor = np.zeros((jacobian.shape[1] + 1,) * 2)
     for i in range(0, len(residual), _FACTORED_ROWS):
         rows = np.column_stack([part[i : i + _FACTORED_ROWS] for part in (jacobian, residual)])
         factor = np.asarray(np.linalg.qr(np.vstack([factor, rows]), mode="r"))

@@ -140,8 +140,8 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     if not failed:
         return [entry.value for entry in results]
     first, _, rest = failed[0].error.partition("\n")
-    what = f"{len(failed)} of {len(results)} tasks failed; the first failure is that of {failed[0].name}, {first}"
-    if first.partition(":")[0] in {kind.__name__ for kind in YidError.__subclasses__()}:
+    what = f"{len(failed)} of {len(results)} tasks failed; the first failure is that of {failed[0].name}: {first}"
+    if "\n  where: " in failed[0].error:
         told = dict(line.strip().partition(": ")[::2] for line in rest.splitlines())  # as `YidError.__str__` writes it
         where = f"task '{failed[0].name}': {told.get('where', 'its arguments')}"
         hint = f"{told.get('try', 'correct this cause')}. Then repeat this command: only the failed tasks run again"
@@ -217,7 +217,7 @@ _TaskFinishedCallback = Callable[[_Job, TaskResult], None]
 def _perform(job: _Job) -> str:
     """Run a task and write its result file; returns the error message, empty on success."""
     if unlike := software_fingerprint_differences(job.maker, software_fingerprint()):
-        return f"ParallelWorkError: {_unfit(socket.gethostname(), unlike)}"
+        return str(_unfit(socket.gethostname(), unlike))
     begun = time.perf_counter()
     entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}
     failed = job.file.with_suffix(".error.json")
@@ -225,7 +225,7 @@ def _perform(job: _Job) -> str:
         value = job.function(**job.task.arguments)
         write_strict_json(job.file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
     except Exception as error:
-        text = f"{type(error).__name__}: {error}"
+        text = str(error) if isinstance(error, YidError) else f"{type(error).__name__}: {error}"
         with contextlib.suppress(OutputError):
             write_strict_json(failed, {**entry, "error": text})
         return text

@@ -123,7 +123,8 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
     if options.point is None:
         what, hint = "plan.point is missing, the point that moves to the target", "add --set plan.point=NAME"
-        raise ConfigError(what, where="plan.point", allowed=", ".join(system.point_frames), hint=hint)
+        allowed = ", ".join(system.point_frames or system.mechanism.frames)
+        raise ConfigError(what, where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
     inside = FramePositionEvaluator(system, boxed, "plan.frames_in_box") if options.goal == "box" else None
@@ -263,7 +264,8 @@ def _outcome(
     far = not error <= most
     if shot.is_converged and far:
         message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its target "
-        message += f"({1e3 * most:.3g} mm is tolerated). Set a longer plan.duration or a nearer target"
+        message += f"({1e3 * most:.3g} mm, {TARGET_REACHED_TOLERANCE_FACTOR:g} times tolerance or std, is tolerated). "
+        message += "Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
     return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, grouped, p_value_text, unseen_effects_sentence
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, p_value_text, unseen_effects_sentence
 from yid_ocp.effects import EFFECTS
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
@@ -81,17 +81,17 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    order = "Refitted candidates come first, by held-out error. Closure alone: part of the held-out error beyond noise"
-    order += " that the candidate alone removes (–: not refitted). Values without ± are forecasts of a linear model."
+    order = (
+        "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the held-out"
+    )
+    order += " error beyond noise that the candidate alone removes. Values without ± are forecasts of a linear model."
     yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
     yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
-    rows = [
-        ("effect", "places"),
-        *((k, ", ".join(own)) for k, own in grouped(label.partition("@")[::2] for label in unseen).items()),
-    ]
+    places = grouped(label.partition("@")[::2] for label in unseen)
+    rows = [("effect", "places"), *((kind, ", ".join(own)) for kind, own in places.items())]
     yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
@@ -256,25 +256,26 @@ def _rate(own: Mapping[str, Any]) -> str:
 @register_summary("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
-    found = grouped(own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
+    told = (own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
+    found = grouped(((name, own["unit"]), own) for name, own in told)  # runs of other models may have other units
     names = sorted(found, key=lambda name: -len(found[name]))
-    units = {name: found[name][-1]["unit"] for name in names}
-    heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
+    heads = [(key, f"{key[0]} [{key[1]}]" if key[1] else key[0]) for key in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
-    ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
-    said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
-    said += [f"{e['name']} ended as {e['status']}: {e['message'].splitlines()[0]}." for e in runs if not e["ok"]]
+    ends = [entry["status"].replace("error", "stopped by an error").replace("_", " ") for entry in runs]
+    said = [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
+    failed = ((end, run) for end, run in zip(ends, runs, strict=True) if not run["ok"])
+    said += [f"{run['name']}: {end}: {run['message'].splitlines()[0].removesuffix('.')}." for end, run in failed]
     alike = result["history"]
     said += [] if alike is None else _history_sentences(alike)
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
-    for name in names:
-        values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
+    for (name, unit), entries in found.items():
+        values = [own["value"] for own in entries if own["verdict"] in _FOUND_VERDICTS]
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
-            spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
+            spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), unit))
     yield SummaryTable(spread, "Parameters over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
@@ -282,12 +283,13 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from () if alike is None else _consistency_blocks(alike)
 
 
-def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
+def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str], str]) -> Iterator[Sequence[str]]:
     yield "run", "status", "chi2/n (noise alone: 1)", "effects", *heads.values(), "time"
     for entry in runs:
         cells = []
-        for own in (entry["parameters"].get(name, {"value": None}) for name in heads):
-            if own["value"] is None:
+        for name, unit in heads:
+            own = entry["parameters"].get(name, {"value": None})
+            if own["value"] is None or own["unit"] != unit:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
                 cells.append(value_and_uncertainty_text(own["value"], own["std"], None))
@@ -383,8 +385,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    columns = "law", "held-out error", "± standard error", f"difference from {best}", "± of difference", "unit", "note"
-    rows: TableRows = [columns]
+    rows: TableRows = [("law", "held-out error", "± std error", f"difference from {best}", "± of it", "unit", "note")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
@@ -543,7 +544,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for name, entry in gate["channels"].items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows) if gate["channels"] else "The file is not tested: its replay has no recorded channel."
+    yield SummaryTable(rows) if gate["channels"] else "The file is untested: MuJoCo replays no recorded channel."
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
     if worst := max(ratios, key=lambda name: ratios[name], default=""):

@@ -48,6 +48,7 @@ _BASELINE_DESCRIPTIONS = {
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
 _MAX_DIRECTIONS = 8
+_HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
@@ -67,6 +68,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
         fit = result["fit"]
         said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
+        if said and any(issue["cause"] == "noise_overstated" for issue in result.get("issues") or ()):
+            said = "The stated noise is too large to test whether the model explains the recordings."
         found, doubts = (*_found_and_lost(free, is_safe, mild), said), (*notes, *predicted)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
@@ -74,6 +77,10 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = "the fit failed" if failed else "the fit did not converge"
         said = f"Do not use the values, because {said}: {result['message'].removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
+        chi2 = 0.0 if failed else result["fit"]["chi2_per_dof"] or 0.0
+        said += f" With {chi2:.3g} times the chi2 of noise, first check units, signs and names." * (
+            chi2 > _HOPELESS_CHI2
+        )
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
@@ -359,7 +366,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shares = ("" if own[key] is None else f"{percent_number_text(own[key])} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    steps = {"plan with the estimates in RUN, a folder of `solve`": "plan --set plan.parameter_run_folder=RUN"}
+    steps = {"plan with run RUN of `solve` (path from the configuration)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
@@ -374,8 +381,8 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         return
     place, asked = ", ".join(f"{x:.4g}" for x in result["place"]), 1e3 * result["tolerance"]
     yield (
-        f"In {result['duration']:g} s the point '{result['point']}' moves to ({place}) m in the world. In the model it "
-        f"stays within {1e3 * result['error']:.3g} mm of this position for the next {result['settle']:g} s "
+        f"The target of the point '{result['point']}' after {result['duration']:g} s is ({place}) m in the world. In "
+        f"the model it stays within {1e3 * result['error']:.3g} mm of it for the next {result['settle']:g} s "
         f"(position_tolerance: {asked:g} mm). No point of the object is then faster than "
         f"{1e3 * result['swing']:.3g} mm/s (point_rest_speed_tolerance: {1e3 * result['speed_tolerance']:g} mm/s)."
     )
@@ -451,6 +458,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
         apart.setdefault(", ".join(gaps), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
+    share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
+    yield f"The noise is {share:g} of the std in a fit (diagnosis.noise_fraction_of_stated_std)." if share < 1 else ""
     for text, names in apart.items():
         said = f"At the start of {abbreviated_names_text(names)}, hand and object are apart at grasp {text}."
         yield said if text else ""
@@ -469,6 +478,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
+    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] else {})
 
@@ -541,12 +551,8 @@ def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for name in dict.fromkeys(result["asked"] or shown):
         own = known[name]
         rows, seen = own["rows"], own["seen"]
-        if seen is None or not rows:
-            sight = ""
-        elif len(seen) == len(rows):
-            sight = "all"
-        else:
-            sight = _row_names_text(seen) or "none"
+        observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
+        sight = "" if seen is None or not rows else observed
         moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
         changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
         sensors = own["best"], ", ".join(own["read"])
@@ -566,7 +572,8 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
     else:
-        yield SummaryStatement(f"The file recording.h5 has {result['duration']:g} s of simulated motion.", "verdict")
+        said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
+        yield SummaryStatement(said, "verdict")
         rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
         yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
         option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"

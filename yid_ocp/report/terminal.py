@@ -155,6 +155,8 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
     if use := result.get("to_use"):
         left_out = " and ".join(use["uncounted_errors"])
         stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
+        lost = abbreviated_names_text(use.get("left_out", ()))
+        stated += f"; left out as too uncertain: {lost}" * bool(lost)
         yield f"To use these numbers, copy the lines below, as text, YAML, MJCF or LaTeX ({stated}):"
         lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
         yield CodeBlock("\n".join(lines))

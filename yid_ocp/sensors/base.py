@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal, Protocol
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Len
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, nearest_name_question
@@ -46,7 +46,7 @@ class SensorOptions:
         Mapping[str, str],
         OptionInfo("model frame of a point (or T1:40%), wrist sensor or IMU whose name differs from the recorded one"),
     ] = field(default_factory=dict)
-    used_points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; default: all points of the model")] = None
+    used_points: Annotated[tuple[str, ...] | None, Len(1), OptionInfo("points to use; default: all")] = None
     bias_std: Annotated[
         _NonNegative | Mapping[str, _NonNegative] | None,
         OptionInfo(

@@ -124,7 +124,7 @@ def run_batch(
             for path in inputs:
                 file_sha256(path)
         except YidError as error:
-            results[member.name] = TaskResult(member.name, error=f"{type(error).__name__}: {error}")
+            results[member.name] = TaskResult(member.name, error=str(error))
             log.warning("the run %s is left out, because it cannot start: %s", member.name, error.what)
             continue
         own = {"name": member.name, "config": member.config_file, "settings": list(member.overrides)}

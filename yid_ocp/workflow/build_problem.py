@@ -238,7 +238,7 @@ def _check_recordings(
     clamped = () if cable is None else cable.clamped_vertex_names
     for role, recordings in zip(kept, _once(run, estimate, held_out, issues), strict=True):
         for recording in recordings:
-            found = recording_quality_issues(recording, _choice(run))
+            found = recording_quality_issues(recording, _choice(run), run.problem.duration or np.inf)
             issues += found
             if any(issue.severity == "refused" for issue in found):
                 continue

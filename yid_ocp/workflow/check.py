@@ -15,7 +15,7 @@ from yid_ocp.analysis import discretisation, step_diagnostics
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
+from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.display import Progress, abbreviated_names_text, count_with_noun
 from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
@@ -114,12 +114,16 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": share * float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
-    groups = {group.name: _group(group) for group in recording.all_groups}
+    groups = {}
+    for own in recording.all_groups:
+        period, gap = median_sample_period(own.t), float(np.max(np.diff(own.t), initial=0.0))
+        counts = {"samples": len(own.t), "names": list(own.names)}
+        groups[own.name] = counts | {"rate": 1.0 / period if period else 0.0, "longest_gap": gap}
     entry: dict[str, Any] = {"recording": episode.name, "role": role, "duration": recording.duration}
-    entry |= {"steps": episode.grid.steps, "groups": groups, "noise": noise}
+    entry |= {"steps": episode.grid.steps, "groups": groups, "noise": noise, "noise_fraction": share}
     rate = 1.0 / problem.step.time_step
     if arm is not None:
-        recorded = 1.0 / float(np.median(np.diff(arm.t)))
+        recorded = 1.0 / median_sample_period(arm.t)
         if recorded < 0.5 * rate:
             said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). The motion in "
             said += f"between is interpolated. If possible, record at {0.5 * rate:.4g} Hz or more"
@@ -139,13 +143,6 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"for '{episode.name}' with the initial parameters, {rest.message}")
     entry["grasp_gaps"] = min_grasp_gaps_at_start(problem, episode)
     return entry
-
-
-def _group(group: JointGroup | PointGroup | SensorChannelGroup) -> dict[str, Any]:
-    steps = np.diff(group.t)
-    rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
-    gap = float(np.max(steps, initial=0.0))
-    return {"samples": len(group.t), "rate": rate, "longest_gap": gap, "names": list(group.names)}
 
 
 def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]:

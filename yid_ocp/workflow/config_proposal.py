@@ -166,6 +166,9 @@ def propose_config_choices(
         start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
             moving = f"{mover} already moves at the start of recording '{recording.name}'"
+    period = median_sample_period(recorded.t) or _MAX_TIME_STEP
+    count = math.floor(_MAX_TIME_STEP / period + 1e-3)  # sample periods in a step; a slow clock's period is divided
+    step = period * count if count else period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -180,7 +183,7 @@ def propose_config_choices(
         moving or "all recordings begin at rest",
         _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
-        _time_step(median_sample_period(recorded.t) or _MAX_TIME_STEP),
+        float(f"{step:.3g}"),
         select_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
         {group.name: _clock(group) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
@@ -205,7 +208,7 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
     if not (known := [name for name in whole.joint_names if name in recorded]):
         what = f"none of the recorded joints is a joint of the robot: {', '.join(recorded)}"
         hint = "give the URDF or MJCF file of the robot that was recorded. If it is the same robot with other names, "
-        hint += f"rename its joints at the import: --joints {recorded[0]}={whole.joint_names[0]},..."
+        hint += f"rename its joints at the import: --joints {recorded[0]}=NAME_IN_ROBOT,..."
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     return known
 
@@ -278,7 +281,10 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
     wrists = [name for name in wrists if name != ESTIMATED_WRENCH_GROUP_NAME]
     seen = ", ".join([*(group.name for group in recording.points), *wrists])
-    is_servo = joints.effort is None and _commanded(joints)
+    command = joints.position if joints.position_command is None else joints.position_command
+    turned = np.std(joints.position - joints.position.mean(axis=0))
+    is_commanded = np.sqrt(np.mean((command - joints.position) ** 2)) > _COPIED_COMMAND_RATIO * turned
+    is_servo = joints.effort is None and bool(is_commanded)
     if not has_object and not is_servo and joints.effort is None and not wrists:
         what = "the recording has no measurement of the forces that move the arm"
         allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
@@ -300,13 +306,6 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if seen:
         return "prescribed", f"the arm moves as measured, as it carries the object; also recorded: {seen}"
     return "prescribed", "the arm moves as measured, and its efforts show the object, because nothing else was measured"
-
-
-def _commanded(joints: JointGroup) -> bool:
-    if joints.position_command is None:
-        return False
-    apart = np.sqrt(np.mean((joints.position_command - joints.position) ** 2))
-    return bool(apart > _COPIED_COMMAND_RATIO * np.std(joints.position - joints.position.mean(axis=0)))
 
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
@@ -521,13 +520,6 @@ def _point_noise(group: PointGroup) -> _GroupNoise:
         std = _CAMERA_STD if slow else _MARKER_STD
         return _GroupNoise(std, "m", "a guess, because the data are too slow or too clean to show the noise")
     return _GroupNoise(math.sqrt(math.fsum(x * x for x in sizes) / np.count_nonzero(sizes)), "m", _SEEN_NOISE)
-
-
-def _time_step(period: float) -> float:
-    """Return a time step [s] of at most `_MAX_TIME_STEP`: whole sample periods or, for slow clocks, a part of one."""
-    whole = math.floor(_MAX_TIME_STEP / period + 1e-3)
-    step = period * whole if whole else period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
-    return float(f"{step:.3g}")
 
 
 def _clock(group: JointGroup | PointGroup) -> str:

@@ -151,6 +151,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
 
     Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this.
     """
+    calibrated = _read_calibrated_model(folder)
     if form not in _MODEL_FORMATS:
         why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")
         allowed, where = ", ".join((*_MODEL_FORMATS, _MCAP)), "--format, or the ending of --out"
@@ -159,7 +160,6 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     if out.is_file():
         what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
         raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
-    calibrated = _read_calibrated_model(folder)
     progress.begin_stage("building the model")
     full, unknown = calibrated.system(), [n for n, std in calibrated.parameter_stds.items() if std is None]
     if form == "yaml":
@@ -317,7 +317,8 @@ def _replayed(
 ) -> dict[str, ReplayErrorAgainstRecording]:
     found: dict[str, list[ReplayErrorAgainstRecording]] = {}
     for i, recording in enumerate(recordings):
-        progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
+        own = f"{recording.name}{' as exported' * round_}"
+        progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), own)
         for name, error in replay_mismatch_by_channel(text, system, recording).items():
             found.setdefault(name, []).append(error)
     together = {}

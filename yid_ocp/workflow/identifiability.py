@@ -96,7 +96,7 @@ def run_identifiability(
         system, wanted = build_system(run), asked.interval_parameters
         if not isinstance(wanted, str):
             free = free_parameter_names(run, system.parameters)
-            require_known_names(wanted, free, "free parameter", "--intervals", ConfigError)
+            require_known_names(wanted, free, "free parameter", "--intervals (else `all` or `none`)", ConfigError)
         problem = whole = build_problem(run, build_step(run, system_with_grasp_offset_effects(system)))
         limits = run.diagnosis.fit_excess_residual_criteria
         solution = None

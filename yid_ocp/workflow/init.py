@@ -57,6 +57,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
             hint, allowed = "add --replace to overwrite it, or choose an --out in another folder", "a new file"
+            hint = f"to use it again, give {file} as the recording; or {hint}" if file in written else hint
             raise OutputError(f"{file.name} already exists", where=str(file), allowed=allowed, hint=hint)
 
     def near(path: str | Path) -> str:
@@ -72,7 +73,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
     lines = _summary_lines(proposal, out, recordings, result["picture"] is not None)
     lines += [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
-    print_result(arguments, result, lambda: lines, f"configuration: {out}", str(out))
+    end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
+    print_result(arguments, result, lambda: lines, end, str(out))
     return EXIT_DONE
 
 
@@ -86,7 +88,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
     if (template := templates.get(word)) is None:
-        said = unknown_name_error_arguments(word, templates, "leave --object out for an arm that holds nothing")
+        said = unknown_name_error_arguments(word, templates, "use --object cable for a rope, or leave --object out")
         raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
@@ -363,18 +365,14 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
                 entries.append(f"bias_std: {values}")
                 said += ". bias_std is the expected constant error of a torque (a guess, 1 % of its limit)"
             if told_by_points:
-                entries = ["use: false", *entries]
                 said = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
-            entries = ["use: false", *entries]
             said = "not used, because the frames of its points are unknown. To use it, set "
             said += "{frame_by_recorded_name: {POINT: FRAME}, use: true}"
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arm. To use it, set model.arms.mode: prescribed and use: true here"
-            entries = ["use: false", *entries]
             said = f"not used, because {why if proposal.arm_mode == 'driven' else 'its frame is unknown, see below'}"
         elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
-            entries = ["use: false", *entries]
             said = "not used: the robot's driver computes it from joint torques. Use it only in place of efforts"
-        yield group, entries, said, places
+        yield group, ["use: false"] * said.startswith("not used") + entries, said, places

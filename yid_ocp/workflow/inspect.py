@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.display import Progress
-from yid_ocp.errors import ModelError
+from yid_ocp.errors import ConfigError, ModelError, require_known_names
 from yid_ocp.export.equations import export_step_functions
 from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -59,8 +59,7 @@ def _run_inspect(
         symbols, parameters = NamedStepEquations.from_equations(step.equations), step.system.parameters
         # check names before anything slow; parameter names have no brackets
         named = [text for text in map(str.strip, entries) if text and not set(text) & set("[,")]
-        for name in named:
-            parameters.index(name)
+        require_known_names(named, parameters.names, "parameter", "--entry", ConfigError)
         chosen = [symbols.equation_or_derivative_by_name(text) for text in entries if text.strip() not in named]
         free = free_parameter_names(run, parameters)
         progress.begin_stage("linearising the equations of a step")

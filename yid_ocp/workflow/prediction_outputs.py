@@ -79,9 +79,9 @@ def copyable_estimate_texts(
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `joints` (number of links, range
-    of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of
-    `latex`, `export` (the `command` to continue with) and `cite`. `theta` (ntheta,) holds all parameters.
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (other free parameters),
+    `joints` (number of links, range of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first
+    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters.
     """
     found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
@@ -109,6 +109,7 @@ def copyable_estimate_texts(
     return {
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
         "uncounted_errors": list(uncounted_errors),
+        "left_out": [n for n, e in estimates.items() if e.free and n not in found],
         "joints": joints,
         "yaml": [*model_yaml, "parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
         "mjcf": lines,

@@ -54,7 +54,9 @@ def run_simulate(
         if recording is not None:
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
-            result |= {"status": "done", "message": "", "duration": recording.duration}
+            is_short = (run.problem.duration or 0.0) > 1.01 * recording.duration
+            said = "The recorded motion is shorter than problem.duration." * is_short
+            result |= {"status": "done", "message": said, "duration": recording.duration}
             result["file"] = str(folder.final_path / "recording.h5")
             result |= {"groups": groups, "truth": dict(recording.true_parameters)}
         more = {"recordings": [] if recording is None else [recording], "system": system}

@@ -431,8 +431,9 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
         allowed += f"kind {', '.join(known)}"
         meant = (kind, "NAME") if kind in known else column_meanings([given], _COMPONENTS)[0][0]  # `torque:elbow`
-        hint = "" if meant else nearest_name_question(kind, known)
-        hint = hint or f"write for example --columns '{column}={':'.join(meant or ('position', 'JOINT'))}'"
+        hint = "" if meant else nearest_name_question(kind, ("t", base.SKIP_COLUMN_KEYWORD, *known))
+        example = ":".join(meant or ("position", "JOINT")).strip(":")
+        hint = hint or f"write for example --columns '{column}={example}'"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
 
