@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from yid_ocp.data.channel_checks import Issue
 from yid_ocp.display import ReprMixin, ReprTexts
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test
-from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
+from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors, triangular_factor
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -173,12 +173,8 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 def noise_only_covariance_sqrt(problem: EstimationProblem, evaluation: Evaluation) -> Array:
     """Compute F (nx, nx) of the unknowns' covariance F F' from noise alone. F is precise in weak directions, too."""
-    count, scale = len(problem.initial_unknowns), problem.unknown_scales
-    _, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
-    _, singular, vectors = np.linalg.svd(np.linalg.qr(jacobian * scale, mode="r"), full_matrices=False)
-    if len(vectors) < count:
-        rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
-        vectors, singular = np.vstack([vectors, rest.T]), np.pad(singular, (0, count - len(singular)))
+    scale, (residual, jacobian) = problem.unknown_scales, residual_and_jacobian_with_stated_priors(problem, evaluation)
+    _, singular, vectors = np.linalg.svd(triangular_factor(jacobian, residual)[:-1, :-1] * scale)
     return scale[:, None] * vectors.T / np.maximum(singular, 1e-8)
 
 
@@ -211,22 +207,21 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
-    residual, jacobian = residual_and_jacobian_with_stated_priors(problem, evaluation)
-    jacobian = jacobian * (scale := problem.unknown_scales)
-    priors = jacobian[problem.residual_rows.stated_priors] / problem.options.stated_std_factor
-    information = jacobian.T @ jacobian
+    scale, (residual, jacobian) = problem.unknown_scales, residual_and_jacobian_with_stated_priors(problem, evaluation)
+    priors = jacobian[problem.residual_rows.stated_priors] * scale / problem.options.stated_std_factor
+    information = jacobian.T @ jacobian * np.outer(scale, scale)
     inverse = np.asarray(np.linalg.pinv(information, rcond=1e-10, hermitian=True), float)
     plain = np.maximum(np.diag(covariance), 1e-300)
     widest = plain
     for labels in _clusters(problem):
-        middle = _score_covariance(information, inverse, [(jacobian[rows], residual[rows]) for rows in labels])
+        middle = _score_covariance(information, inverse, ((jacobian[rows] * scale, residual[rows]) for rows in labels))
         middle += priors.T @ priors
         widest = np.maximum(widest, np.diag(inverse @ middle @ inverse) * scale**2)
     factor = np.sqrt(widest / plain)
     return covariance * np.outer(factor, factor)
 
 
-def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tuple[Array, Array]]) -> Array:
+def _score_covariance(information: Array, inverse: Array, clusters: Iterable[tuple[Array, Array]]) -> Array:
     """Covariance (nx, nx) of the sum of scores J' r over independent clusters of rows (J, r).
 
     A fit follows a cluster that alone determines a direction, so that the cluster's residual is too small. Its score is
@@ -235,9 +230,10 @@ def _score_covariance(information: Array, inverse: Array, clusters: Sequence[tup
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     back = root @ inverse
-    sums, adjusted = np.array([slopes.T @ errors for slopes, errors in clusters]), []
-    for (slopes, _), total in zip(clusters, sums - sums.mean(axis=0), strict=True):
-        share, axes = np.linalg.eigh(back @ (slopes.T @ slopes) @ back.T)
+    parts, adjusted = [(slopes.T @ slopes, slopes.T @ errors) for slopes, errors in clusters], []
+    sums = np.array([score for _, score in parts])
+    for (own, _), total in zip(parts, sums - sums.mean(axis=0), strict=True):
+        share, axes = np.linalg.eigh(back @ own @ back.T)
         # directions that no other cluster informs cannot be corrected
         kept = share < 1 - 1e-6
         grown = np.where(kept, 1.0 / np.sqrt(np.where(kept, 1.0 - np.maximum(share, 0.0), 1.0)), 0.0)
