@@ -30,9 +30,8 @@ LIMITS = Thresholds()
 FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
 A, S = "friction@elbow.a", "friction@elbow.s"
 CERTAIN = np.zeros((1, 1))
-UNKNOWN = SimpleNamespace(unknown_indices_affecting_recording=range)
 TWO_RECORDINGS = SimpleNamespace(
-    problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200)), unknowns=UNKNOWN),
+    problem=SimpleNamespace(episodes=["first", "second"], system=SimpleNamespace(effects=range(200))),
     with_step_of_only_effects=lambda group: [effect.label for effect in group],
 )
 
@@ -283,7 +282,7 @@ def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
         raise SolverError("it snaps", where="model", hint="")
 
     monkeypatch.setattr(module, "screen_candidates", snap)
-    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard())
+    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2)
     assert search.screen((FRICTION,), {A: 0.7}, "beside it").candidate_scores == ()
     assert list(search.record.screenings) == ["beside it"]
 
@@ -305,14 +304,20 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
-    search, march = (RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0), [["a"], ["b"], ["c"], ["d"]])
+    search, march = (
+        RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0, n_batched_rollouts=2),
+        [["a"], ["b"], ["c"], ["d"]],
+    )
     found = refit_with_each_effect(search, (), tried, {})
     assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
     assert refit_with_each_effect(search, (), tried[:1], {}) == []
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    assert len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard()), (), tried, {})) == 6
+    assert (
+        len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2), (), tried, {}))
+        == 6
+    )
     assert batches == [[*"abcdef"]]
 
 

@@ -40,6 +40,7 @@ from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests_of_fit
+from yid_ocp.integrator.compiled import MAX_BATCHED_COLUMNS
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
@@ -101,7 +102,9 @@ def diagnose(
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         composed = replace(composed, refit_solver=refit_solver)
         deadline = begun + (thresholds.budget or math.inf)
-        search = RefitContext(composed, thresholds, progress, store, deadline, stage_ends={"": begun})
+        columns = len(composed.problem.unknowns.unknown_indices_affecting_recording(0))
+        batched = len(composed.problem.episodes) * (columns <= MAX_BATCHED_COLUMNS)
+        search = RefitContext(composed, thresholds, progress, store, deadline, batched, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         nominal = fit_nominal_model(problem, composed, solution, store, thresholds)

@@ -21,7 +21,6 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test, whitening
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, noise_only_covariance_sqrt
-from yid_ocp.integrator.compiled import MAX_BATCHED_COLUMNS
 from yid_ocp.parallel import map_in_threads, map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
@@ -137,6 +136,7 @@ class RefitContext:
     progress: Progress
     store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
+    n_batched_rollouts: int = 1  # of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
@@ -401,11 +401,8 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
-    problem = search.problem.problem
-    columns = len(problem.unknowns.unknown_indices_affecting_recording(0))
-    merged = partial(map_with_merged_calls, questions_per_item=len(problem.episodes))
-    # no batch would have so many columns, and waiting fits would keep their memory
-    at_once = map_in_threads if columns > MAX_BATCHED_COLUMNS else merged
+    count = search.n_batched_rollouts
+    at_once = partial(map_with_merged_calls, questions_per_item=count) if count else map_in_threads
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break
