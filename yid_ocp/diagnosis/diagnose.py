@@ -24,6 +24,7 @@ from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
+    REFIT_SOLVER,
     EffectSearchRecord,
     RefitContext,
     RefitStore,
@@ -438,7 +439,7 @@ def fit_nominal_model(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
-    solution = solution or fit_problem(problem, GaussNewton(max_iterations=30), verdicts=False)
+    solution = solution or fit_problem(problem, composed.refit_solver or REFIT_SOLVER, verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     composed = composed.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)

@@ -27,12 +27,11 @@ from yid_ocp.solvers import base
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
-# Length of the next step as a fraction of a rejected one whose trial had no prediction.
-_LENGTH_AFTER_FAILURE = 0.25
-# The search ends after this many accepted steps that together lower the cost by no more than this (a tenth of the cost
-# of one standard deviation) and move no unknown by more than this fraction of its standard deviation, if the predicted
-# decrease is at most the cost of a 95 % interval.
-_PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0.1
+_LENGTH_AFTER_FAILURE = 0.25  # of the next step, over that of a rejected one whose trial had no prediction
+# The search ends after this many accepted steps (5 with coarse tolerances) that together lower the cost by no more than
+# this (a tenth of the cost of one standard deviation) and move no unknown by more than this fraction of its standard
+# deviation, if the predicted decrease is at most the cost of a 95 % interval.
+_PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = (20, 5), 0.05, 0.1
 _LOWEST = "the cost cannot be lowered any further"
 
 
@@ -45,8 +44,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
     search converges at a stationary point (`is_stationary_point`); a short or damped step with a small predicted
-    decrease is not sufficient. It also converges (`stopped_at_noise_level`) after `_PATIENCE_STEPS` steps that together
-    lower the cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
+    decrease is not sufficient. It also converges (`stopped_at_noise_level`) after several steps that together lower the
+    cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps per start and per weighting")] = 100
@@ -98,9 +97,10 @@ class GaussNewton(base.SolverWithCheckedSettings):
             if not rejected:
                 slope = max_abs_projected_gradient(x, jacobian.T @ residual, lower, upper, size)
                 recorder.record_iterate(now.cost, x, slope)
-                saved = _saved(problem, recorder.history, now)
+                patience = _PATIENCE_STEPS[self == self.with_coarse_tolerances]
+                saved = _saved(problem, recorder.history, now, patience)
                 if saved is not None:
-                    last = f"the last {_PATIENCE_STEPS} steps together lowered the cost by only {saved:.2g}"
+                    last = f"the last {patience} steps together lowered the cost by only {saved:.2g}"
                     message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
@@ -151,12 +151,12 @@ def _step_within_length(reduced: Array, mu: float, low: Array, high: Array, long
         mu *= 3.0
 
 
-def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Evaluation) -> float | None:
+def _saved(problem: EstimationProblem, history: Sequence[base.Iterate], now: Evaluation, steps: int) -> float | None:
     """Total decrease of the cost in the last steps if it is negligible, else None."""
-    if len(history) <= _PATIENCE_STEPS:
+    if len(history) <= steps:
         return None
-    before, last = history[-1 - _PATIENCE_STEPS], history[-1]
-    saved, unit = before.cost - last.cost, problem.stated_rms_noise_of_data_residuals**2
+    before, last, unit = history[-1 - steps], history[-1], problem.stated_rms_noise_of_data_residuals**2
+    saved = before.cost - last.cost
     if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
         return None
     if achievable_cost_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
