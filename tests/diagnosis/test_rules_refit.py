@@ -314,10 +314,8 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    assert (
-        len(refit_with_each_effect(RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2), (), tried, {}))
-        == 6
-    )
+    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2)
+    assert len(refit_with_each_effect(search, (), tried, {})) == 6
     assert batches == [[*"abcdef"]]
 
 
@@ -418,6 +416,6 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
     monkeypatch.setattr(diagnosing, "fit_problem", lambda *given, **how: asked.append(given) or solution(2.0))
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
-    composed = SimpleNamespace(with_smoothed_input_errors_of=lambda fitted: "composed")
+    composed = SimpleNamespace(with_smoothed_input_errors_of=lambda fitted: "composed", refit_solver=None)
     assert diagnosing.fit_nominal_model("problem", composed, given) == start
     assert len(asked) == solved
