@@ -282,7 +282,7 @@ def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
         raise SolverError("it snaps", where="model", hint="")
 
     monkeypatch.setattr(module, "screen_candidates", snap)
-    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2)
+    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched=2)
     assert search.screen((FRICTION,), {A: 0.7}, "beside it").candidate_scores == ()
     assert list(search.record.screenings) == ["beside it"]
 
@@ -305,7 +305,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     monkeypatch.setattr(module, "refit_with_effects", one)
     monkeypatch.setattr(module, "map_with_merged_calls", batched)
     search, march = (
-        RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0, n_batched_rollouts=2),
+        RefitContext(TWO_RECORDINGS, LIMITS, Heard(), deadline=35.0, n_batched=2),
         [["a"], ["b"], ["c"], ["d"]],
     )
     found = refit_with_each_effect(search, (), tried, {})
@@ -314,7 +314,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
     # without one all march together, as ever
     batches.clear()
-    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched_rollouts=2)
+    search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched=2)
     assert len(refit_with_each_effect(search, (), tried, {})) == 6
     assert batches == [[*"abcdef"]]
 

@@ -136,7 +136,7 @@ class RefitContext:
     progress: Progress
     store: RefitStore = NO_REFIT_STORE
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
-    n_batched_rollouts: int = 1  # of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
+    n_batched: int = 1  # rollouts of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
@@ -400,8 +400,9 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
-    count = search.n_batched_rollouts
-    at_once = partial(map_with_merged_calls, questions_per_item=count) if count else map_in_threads
+    at_once = (
+        partial(map_with_merged_calls, questions_per_item=search.n_batched) if search.n_batched else map_in_threads
+    )
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break

@@ -245,8 +245,7 @@ class EstimationProblem(ReprMixin):
             if jacobian is not None and part.jacobian is not None:
                 rows, columns = layout.measurements[i], self.unknowns.unknown_indices_affecting_recording(i)
                 jacobian[rows[0].start : rows[-1].stop, columns] = part.jacobian
-            # derivatives are the largest arrays
-            done.append(replace(result, output_sensitivities=None, torque_correction_sensitivity=None))
+            done.append(replace(result, output_sensitivities=None, torque_correction_sensitivity=None))  # large arrays
         residual = np.concatenate([*residuals, prior])
         cost += 0.5 * float(prior @ prior)
         if jacobian is not None:

@@ -446,8 +446,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    same = f"The library Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}."
-    yield same if agreed else ""
+    yield f"Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (median)")]
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
     for entry in result["recordings"]:

@@ -28,9 +28,8 @@ from yid_ocp.solvers import base
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
 _LENGTH_AFTER_FAILURE = 0.25  # of the next step, over that of a rejected one whose trial had no prediction
-# The search ends after this many accepted steps (5 with coarse tolerances) that together lower the cost by no more than
-# this (a tenth of the cost of one standard deviation) and move no unknown by more than this fraction of its standard
-# deviation, if the predicted decrease is at most the cost of a 95 % interval.
+# The search ends after this many steps (5 if coarse) that together lower the cost by at most this [units of noise] and
+# move no unknown by more than this [std], if the predicted decrease is at most the cost of a 95 % interval.
 _PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = (20, 5), 0.05, 0.1
 _LOWEST = "the cost cannot be lowered any further"
 
@@ -43,9 +42,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
-    search converges at a stationary point (`is_stationary_point`); a short or damped step with a small predicted
-    decrease is not sufficient. It also converges (`stopped_at_noise_level`) after several steps that together lower the
-    cost negligibly compared with the noise, as on a cost with kinks (friction, fast waves over many seconds).
+    search converges at a stationary point (`is_stationary_point`) or, on a cost with kinks (friction, fast waves), after
+    several steps that together lower the cost negligibly compared with the noise (`stopped_at_noise_level`).
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps per start and per weighting")] = 100
@@ -117,13 +115,16 @@ class GaussNewton(base.SolverWithCheckedSettings):
             # damping makes any step promise little
             if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
                 return ended(base.Status.CONVERGED, _LOWEST)
-            trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            tried = np.clip(x + step, lower, upper)
+            trial = evaluate(tried, not rejected, equilibrium_guesses=now.equilibrium_guesses)
+            if rejected and trial.cost < now.cost:
+                trial = evaluate(tried, equilibrium_guesses=trial.equilibrium_guesses)
             recorder.n_evaluations += 1
             gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
             if gain > 1e-3:
                 moved = float(np.max(np.abs(scaled)))
                 longest = 2.0 * float(np.linalg.norm(scaled)) if rejected else np.inf
-                x, now, rejected = np.clip(x + step, lower, upper), trial, False
+                x, now, rejected = tried, trial, False
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
                 if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
                     slope = max_abs_projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
