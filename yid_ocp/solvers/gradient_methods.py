@@ -42,8 +42,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
     Each iteration solves min |J d + r|^2 + mu |d/s|^2 for the step d, subject to lower <= x + d <= upper, with the
     Jacobian J, the damping mu and the scales s. The step is accepted if the cost falls by a sufficient part of the
     predicted decrease (Nocedal and Wright 2006, Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5). The
-    search converges at a stationary point (`is_stationary_point`) or, on a cost with kinks (friction, fast waves), after
-    several steps that together lower the cost negligibly compared with the noise (`stopped_at_noise_level`).
+    search converges at a stationary point (`is_stationary_point`) or, on a cost with kinks (friction, fast waves),
+    after several steps that together lower the cost negligibly compared with the noise (`stopped_at_noise_level`).
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps per start and per weighting")] = 100
