@@ -230,6 +230,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
     if found:
         names = abbreviated_names_text(found)
         text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
+        text += ", or of a typical value near zero" * any(free[n]["std"] > 0.1 * abs(free[n]["value"]) for n in found)
         once = f", once you have checked the issues below ({mild})" if mild else ""
         yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:

@@ -39,8 +39,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             if name != current[0]:
                 current[0] = name
                 count = f", method {names.index(name) + 1} of {len(names)}" if name in names else ", with all noise"
-                cost = " (its cost is that of the source paper, without noise levels)" * (name == "steepest_descent")
-                progress.begin_stage(f"solving by {name}{count}{cost}")
+                progress.begin_stage(f"solving by {name}{' (unweighted cost)' * (name == 'steepest_descent')}{count}")
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
