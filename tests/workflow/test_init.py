@@ -88,7 +88,7 @@ SHORT = np.arange(0, 2, 1 / RATE)
 
 def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
-    assert "`init` assigns recorded m1 to the frame cable:50% of the model, because it was" in capsys.readouterr().out
+    assert "`init` assigns recorded m1 to the frame cable:50% of the model, because its" in capsys.readouterr().out
     run = load_config("run.yaml")
     assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
     assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")

@@ -84,7 +84,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     order = (
         "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the held-out"
     )
-    order += " error beyond noise that the candidate alone removes. Values without ± are forecasts of a linear model."
+    order += " error beyond noise that the candidate removes (negative: adds). Values without ±: linear forecasts."
     yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
     yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""

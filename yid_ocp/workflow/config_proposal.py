@@ -426,7 +426,7 @@ def _near(
         exact = 100 * part_when_straight  # NaN if it never was
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
-        why = f"it was at most {part:.1%} of the length away from {holder}"
+        why = f"its distance from {holder} is at most {part:.0%} of the length"
         why += " (beyond the end, so check length, frame and clocks)" if part > 1.05 else ""
         return _along(branch.name, min(100, percent)), why
     local = poses[0, :3, :3].T @ from_holder[0]
