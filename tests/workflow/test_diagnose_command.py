@@ -15,7 +15,7 @@ from small_problems import pendulum_step
 
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, StoredFit
+from yid_ocp.diagnosis.refit import StoredFit
 from yid_ocp.display import Progress
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.uncertainty import value_and_uncertainty_text
@@ -45,15 +45,15 @@ def close(one, other) -> bool:
 
 
 def counting(patch):
-    """How often the solver of refits is called."""
-    calls = SimpleNamespace(count=0)
+    """How often a refit is solved."""
+    calls, module = SimpleNamespace(count=0), import_module("yid_ocp.diagnosis.refit")
+    solved = module._attempt
 
-    class Counting:
-        def minimize_cost(self, *arguments):
-            calls.count += 1
-            return REFIT_SOLVER.minimize_cost(*arguments)
+    def counted(*arguments):
+        calls.count += 1
+        return solved(*arguments)
 
-    patch.setattr(import_module("yid_ocp.diagnosis.refit"), "REFIT_SOLVER", Counting())
+    patch.setattr(module, "_attempt", counted)
     return calls
 
 
