@@ -187,6 +187,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
     ("setting", "words"),
     [
         ("sensors.points.sdt=3", ["there is no key 'sdt'", "did you mean 'std'?"]),
+        ("problem.weighting=whitend", ['is "whitend", which is not allowed', "did you mean 'whitened'?"]),
         ("sensors.camera.sdt=3", ["sensors.camera.sdt = 3 is not a section", "did you mean 'sensors.camera.std'?"]),
         ("parameters.T2.bend=5", ["is not a section", "add a key, as in parameters.T2.bend.initial"]),
         ("sensors={points: {sdt: 3}}", ["no key 'sdt' in", "'std'?", "where: --set sensors: sensors.points.sdt"]),

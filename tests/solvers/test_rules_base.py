@@ -487,6 +487,7 @@ def test_a_rejected_step_is_followed_by_one_that_is_shorter_along_what_is_weakly
     assert tried[0] == pytest.approx(1.0, rel=0.02)
     assert accepted == 1
     assert tried[accepted] >= 0.02
+    assert [has_slopes for _, has_slopes, _ in problem.asked[1:4]] == [True, False, True]
 
 
 def test_the_step_after_a_rejected_one_is_as_long_as_that_suggests_whatever_the_damping():
