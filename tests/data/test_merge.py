@@ -35,8 +35,7 @@ ROBOT = Recording(JointGroup(("a", "b"), T, wander(T, 0)), name="robot")
 
 def camera(late: float = 0.0, start: float = 0.0) -> Recording:
     """Points on a clock that shows `start` where the robot's shows zero, and that come `late`."""
-    noise = 5e-4 * np.random.default_rng(1).standard_normal((len(FRAMES), 1, 3))
-    seen = tip(wander(FRAMES - late, 0)) + noise
+    seen = tip(wander(FRAMES - late, 0)) + 5e-4 * np.random.default_rng(1).standard_normal((len(FRAMES), 1, 3))
     return Recording(None, (PointGroup("points", ("tip",), FRAMES + start, seen),), name="camera")
 
 

@@ -113,7 +113,8 @@ def test_a_cache_that_others_may_write_or_that_cannot_be_made_is_refused(refused
 def test_without_a_compiler_everything_works_after_one_notice(cache, choose, caplog, pendulum):
     choose("none")
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
-        q, _, _, status = compile_step(pendulum, 0.01)([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
+        step = compile_step(pendulum, 0.01)
+        q, _, _, status = step([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
         assert not compile_step(pendulum, 0.02).is_compiled
     assert status.is_converged
     assert not step.is_compiled
