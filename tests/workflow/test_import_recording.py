@@ -87,7 +87,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
     "no name to write to": ("run.csv", GOOD, "--out", "the option --out is missing"),
     "the name of the file that is read": ("run.csv", GOOD, "--out run.csv", "'run.csv' does not end in .h5"),
-    "an HDF5 that is none": ("run.h5", "x" * 99, "", "its usual ending, such as .csv"),
+    "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
     "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),
     "bad lines alone": ("run.csv", "t,q_a\n0,x\n", "--skip-bad-lines", "no rows"),
