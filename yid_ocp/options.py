@@ -131,7 +131,9 @@ def _words(hint: Any) -> str:
         count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
         return f"a list{count}, each {_words(arguments[0])}".replace(", each a section", " of sections", 1)
     if mapping_value_type(bare) is not None:
-        return f"{{NAME: {_words(mapping_value_type(bare))}, ...}}"
+        choice = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
+        known = f", each NAME one of {', '.join(choice[0].registry)}" if choice else ""
+        return f"{{NAME: {'{}' if choice else _words(mapping_value_type(bare))}, ...}}{known}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
     needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
     return "a section" + f", such as {{{needed}}}" * bool(needed)
@@ -150,8 +152,8 @@ def check_option_bounds(options: Any, where: str) -> None:
 def default_value_hint(key: str, option: Option) -> str:
     """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
     default, allowed = option.default_value, describe_type(option.type_hint)
-    if isinstance(default, (int, float, str)):
-        return f"set {key} to an allowed value, such as {default}"
+    if isinstance(default, (int, float, str)) or (default and isinstance(default, tuple)):
+        return f"set {key} to an allowed value, such as {[*default] if isinstance(default, tuple) else default}"
     return f"write {key} as {allowed}" + ", or leave it out" * (default is not MISSING)
 
 

@@ -36,8 +36,9 @@ class Registry(Generic[_Entry]):
             self._entries.pop(name, None)
 
     def __getitem__(self, name: str) -> _Entry:
-        if name not in self._entries:  # entries whose description has this word are listed first
-            known = sorted(self, key=lambda own: name.lower() not in f"{own} {self._entries[own].__doc__}".lower())
+        if name not in self._entries:  # the earlier the description of an entry has this word, the earlier it is listed
+            found = {own: f"{self._entries[own].__doc__} {own}".lower().find(name.lower()) for own in self}
+            known = sorted(found, key=lambda own: (found[own] < 0, found[own]))
             require_known_names([name], known, self.entry_noun, f"the name of the {self.entry_noun}", ConfigError)
         return self._entries[name]
 

@@ -99,7 +99,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model: {object: {kind: segments, named_segments: {a: {length: 1, radius: 0.1}}}}", ["'mass' is missing"]),
         ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
         ("model:\n  grasp: [left]\n", ["model.grasp"]),
-        ("model:\n  gravity: [0, 0]\n", ["a list of 3"]),
+        ("model:\n  gravity: [0, 0]\n", ["a list of 3", "such as [0.0, 0.0, -9.81]"]),
         ("model:\n  arms: {joints: left_s0}\n", ["a list"]),
         ("problem:\n  duration: true\n", ["a number"]),
         ("problem:\n  time_step: '0.01'\n", ["a number"]),
@@ -124,7 +124,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("problem: {known_initial_states: {}}", ["there is no key"]),
         ("problem: {prior_stds: {a: 1}}", ["there is no key"]),
         ("key_locations: {}", ["there is no key"]),
-        ("name: a", ["there is no key"]),
+        ("parameters.T1.bend.free: false", ["there is no key", "write --set parameters.T1.bend.free=VALUE"]),
         # compared methods are typed like the solver
         (METHODS.replace("VALUE", "max_iterations: abc"), [f"{METHOD}.max_iterations", "number from 1", "line 5"]),
         (METHODS.replace("VALUE", "max_iteration: 3"), [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"]),

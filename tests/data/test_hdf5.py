@@ -120,8 +120,8 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     refused(tmp_path / "absent.h5", "no such file", read_recording)
     (tmp_path / "empty.h5").write_bytes(b"")
     (tmp_path / "text.h5").write_bytes(b"t,q_a\n0,1\n")
-    for name in (".", "empty.h5", "text.h5"):
-        refused(tmp_path / name, "not an HDF5 file", read_recording)
+    for name, advice in ((".", "yid-ocp import"), ("empty.h5", "its usual ending"), ("text.h5", "its usual ending")):
+        assert advice in refused(tmp_path / name, "not an HDF5 file", read_recording).hint
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.999])

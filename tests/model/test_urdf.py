@@ -72,13 +72,11 @@ def test_kept_joints_in_the_order_given(urdf_folder):
 
 def test_limits_and_kinds(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf")
-    by_name = dict(zip(robot.joint_names, robot.joints, strict=True))
-    slide, spin = by_name["slide"], by_name["spin"]
-    assert (slide.kind, slide.coordinate_unit, slide.lower_limit, slide.upper_limit) == ("prismatic", "m", -0.4, 0.6)
-    assert (slide.effort_limit, slide.velocity_limit) == (120.0, 0.8)
-    assert (spin.kind, spin.coordinate_unit) == ("revolute", "rad")
-    assert (spin.lower_limit, spin.upper_limit) == (-math.inf, math.inf)
-    assert (spin.effort_limit, spin.velocity_limit) == (30.0, 6.0)
+    slide, spin = (robot.joints[robot.joint_index(name)] for name in ("slide", "spin"))
+    assert (slide.kind, slide.unit("rad"), slide.lower_limit, slide.upper_limit) == ("prismatic", "m", -0.4, 0.6)
+    assert (slide.effort_limit, slide.velocity_limit, slide.unit("N m s/rad")) == (120.0, 0.8, "N s/m")
+    assert (spin.kind, spin.unit("rad")) == ("revolute", "rad")
+    assert (spin.lower_limit, spin.upper_limit, spin.effort_limit, spin.velocity_limit) == (-math.inf, math.inf, 30, 6)
     np.testing.assert_allclose(slide.axis, [1 / 3, 2 / 3, 2 / 3], rtol=1e-15)
 
 

@@ -35,7 +35,8 @@ def written_run(folder, effects, run, recorded=True):
     folder.mkdir()
     said = run if recorded else replace(run, recordings=replace(run.recordings, held_out=(), estimate=()))
     (folder / "config.yaml").write_text(config_yaml_with_defaults(said))
-    result = {"format": "yid-diagnosis/2", "verdict": "effect", "model": {"parameters": parameters, "covariance": {}}}
+    result = {"format": "yid-diagnosis/2", "verdict": "effect", "to_use": {"left_out": ["T3.twist"]}}
+    result["model"] = {"parameters": parameters, "covariance": {}}
     (folder / "result.json").write_text(json.dumps(result))
     return folder
 
@@ -70,7 +71,7 @@ def gate_holds(gate) -> None:
 def test_the_embedded_diagnosis_in_mujoco(printed, found, tmp_path) -> None:
     out = tmp_path / "y.xml"
     told = printed("export", found, "--out", out)
-    parts = "kelvin_voigt@T1    exact", "no reliable value of T2.twist", "T2.twist           exact, value unknown"
+    parts = "kelvin_voigt@T1    exact", "value of T2.twist, T3.twist", "T3.twist           exact, value unknown"
     assert [part for part in parts if part not in told] == []
     manifest = json.loads(out.with_name(f"{out.name}.manifest.json").read_text())
     gate_holds(manifest["gate"])
@@ -144,13 +145,16 @@ def test_sdf_has_springs_too(found, tmp_path, exported) -> None:
 def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
     effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
     effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
-    coarse = load_config(None, ["model.object.links=1"], SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
+    effects |= {"joint_load_friction@left_e1.share": 0.1}
+    law = "model.friction={law: load, joints: [left_e1]}"
+    coarse = load_config(None, ["model.object.links=1", law], SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     manifest = exported(written_run(tmp_path / "both", effects, coarse, False), tmp_path / "both.xml")
     assert {label: entry["status"] for label, entry in manifest["effects"].items()} == {
         "hysteresis@T2": "not representable",
         "kelvin_voigt@T1": "native",
         "junction_compliance@w_T1": "not representable",
         "joint_coulomb@left_e1": "emulated",
+        "joint_load_friction@left_e1": "not representable",
     }
     assert "memory" in manifest["effects"]["hysteresis@T2"]["how"]
     assert manifest["parameters"]["hysteresis@T2.stiffness"]["status"] == "not representable"
@@ -182,8 +186,7 @@ def test_effects_that_were_found_come_back_free(found, tmp_path, exported) -> No
 
 def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> None:
     recording = pendulum_data.folder / "estimate.h5"
-    broken = tmp_path / "broken"
-    shutil.copytree(found, broken)
+    broken = shutil.copytree(found, tmp_path / "broken")
     (broken / "result.json").write_text("{")
     before = set(tmp_path.rglob("*"))
     for arguments, parts in (

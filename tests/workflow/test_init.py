@@ -463,7 +463,7 @@ ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "nothing, no efforts and no commands": ((), "no measurement of the forces that move the arm", "--object"),
-    "no object by name": (("--object", "none"), "there is no object 'none'", "leave --object out"),
+    "no object by name": (("--object", "none"), "there is no object 'none'", "--object beam for a rod"),
     "a length of nothing": (ONE[:2], "--length needs --object", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
@@ -479,7 +479,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "negative length": ((*CABLE, "--length", "-1"), "the length is -1, not above 0", "write --length NUMBER"),
     "grams": ((*CABLE, "--mass", "50"), "'cable' has the density 2e+06 kg/m^3", "--mass"),
     "too many links": ((*CABLE, "--links", "99"), "--links is 99", "--links"),
-    "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
+    "unknown holder": ((*CABLE, "--holder", "gripper"), "no frame 'gripper'", "an allowed name, such as 'hub'"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
     "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "not a NAME=NUMBER of", "'tip_radius'?"),
     "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not a NAME=NUMBER of", "tip_radius=0.1\n"),
@@ -524,7 +524,7 @@ def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.Captur
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert ": check --length and --point-frame" in capsys.readouterr().out
+    assert re.search("(?s)--length and --point-frame.*no point of points is on the object", capsys.readouterr().out)
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2

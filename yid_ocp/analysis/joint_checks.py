@@ -190,7 +190,7 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
         yield Issue("degrees", words, "refused", float(np.max(beyond)) / margin, advice, "", channel="position")
         return
     for j in np.flatnonzero(beyond > margin):
-        name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
+        name, unit = arm.joint_names[j], arm.joints[j].unit("rad")
         words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g} {unit}"
         words += f" ({margin:g} {unit} is tolerated)"
         advice = "check the joint's zero, unit and column, and whether the recording is of this robot"
@@ -206,7 +206,7 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
     ratio = np.percentile(speed, 99, axis=0) / limits
     j = int(np.argmax(ratio))
     if ratio[j] > _MAX_SPEED_RATIO:
-        able = f"{limits[j]:.3g} {arm.joints[j].coordinate_unit}/s; {_MAX_SPEED_RATIO:g} times is tolerated"
+        able = f"{limits[j]:.3g} {arm.joints[j].unit('rad')}/s; {_MAX_SPEED_RATIO:g} times is tolerated"
         words = f"{arm.joint_names[j]} turns {ratio[j]:.3g} times as fast as its speed limit ({able})"
         advice, depth = "check the units of times and angles", float(ratio[j]) / _MAX_SPEED_RATIO
         yield Issue("speed_limits", words, "not_trusted", depth, advice, "", channel="t")

@@ -81,6 +81,8 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
     # a key of an older version often resembles a present one that means something else
     hints = [*(hints or [f"leave '{name}' out"]), RENAMED_NAMES_HINT]
+    if name.partition(".")[0] in known and "." in name:
+        hints = [f"write --set {name}=VALUE, or nested keys in the file, such as parameters: {{NAME: {{free: false}}}}"]
     if ":" in name:
         hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

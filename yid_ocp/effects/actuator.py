@@ -140,9 +140,8 @@ class _Backlash(_DistortedReading):
 
     def true_value_from_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         # a servo's joint angle is not an input, and its command refers to the motor side
-        return (
-            reading if self.internal_coordinate_symbols else super().true_value_from_reading(channel, reading, effort)
-        )
+        true = super().true_value_from_reading(channel, reading, effort)
+        return reading if self.internal_coordinate_symbols else true
 
 
 class _DistortedEffort(_DistortedReading):
@@ -346,8 +345,7 @@ class _ServoSaturation(_ServoChange):
         """Definition of limit^-16. Reports show `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit of the joint."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
-        torque = "N m" if joint.coordinate_unit == "rad" else "N"
-        return (_limit_definition(_MIN_LIMIT_FRACTION * known, torque, "largest torque of the servo"),)
+        return (_limit_definition(_MIN_LIMIT_FRACTION * known, joint.unit("N m"), "largest torque of the servo"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {"torque_limit_tightness": servo.torque_limit_tightness + self["tightness"]}

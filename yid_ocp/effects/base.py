@@ -43,12 +43,12 @@ class ParameterDefinition:
     range_scale: Callable[[System, str], float] | None = None
 
     def _at_location(self, system: System, location: str) -> ParameterDefinition:
-        """The definition with bounds and range scaled for a location."""
-        if self.range_scale is None:
-            return self
-        scale, (low, high) = self.range_scale(system, location), self.prior_range
+        """The definition with bounds and range scaled for a location, and the unit of a prismatic joint there."""
+        joint = next((joint for joint in system.mechanism.joints if joint.name == location), None)
+        unit = self.unit if joint is None else joint.unit(self.unit)
+        scale, (low, high) = 1.0 if self.range_scale is None else self.range_scale(system, location), self.prior_range
         lower, upper, prior = self.lower * scale, self.upper * scale, (low * scale, high * scale)
-        return replace(self, lower=lower, upper=upper, prior_range=prior, range_scale=None)
+        return replace(self, unit=unit, lower=lower, upper=upper, prior_range=prior, range_scale=None)
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
@@ -251,8 +251,7 @@ def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
     for side in ("left", "right"):
         if side not in found and (own := tuple(name for name in left if name.startswith(f"{side}_"))):
             found[side] = own
-    loose = tuple(name for name in left if not name.startswith(("left_", "right_")))
-    if loose and not found:
+    if not found and (loose := tuple(name for name in left if not name.startswith(("left_", "right_")))):
         found["gripper"] = loose
     return found
 
@@ -307,8 +306,7 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
     parents, found = {joint.parent_index for joint in tree.joints}, []
     for name in arm_joint_names(system):
-        index = tree.joint_index(name)
-        joint = tree.joints[index]
+        joint = tree.joints[index := tree.joint_index(name)]
         finger = joint.kind == "prismatic" and index not in parents and joint.parent_index >= 0
         frames = [frame for frame, entry in tree.frames.items() if entry.joint_index == index]
         if not finger and frames and joint.bodies:

@@ -63,9 +63,7 @@ class _JointFriction(EffectBase):
 
 def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
     """Return a joint friction with the smoothing speed v_s = `speed` [rad/s]. Other effects are returned unchanged."""
-    if speed is None or not isinstance(effect, _JointFriction):
-        return effect
-    return replace(effect, sign_smoothing_speed=speed)
+    return replace(effect, sign_smoothing_speed=speed) if speed and isinstance(effect, _JointFriction) else effect
 
 
 def lower_smoothing_speed_to_joint_min(effect: EffectBase, system: System) -> EffectBase:
@@ -117,7 +115,7 @@ class _JointStribeck(_JointFriction):
 
 @EFFECTS.register("joint_load_friction")
 class _JointLoadFriction(_JointFriction):
-    """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
+    """Load-dependent friction of a gear: F = -share |motor torque - external torque| sgn(v).
 
     The external torque is that of weights and grasps beyond the joint. The sign of the speed is smoothed below v_s,
     at most `_LOAD_SIGN_SMOOTHING_SPEED`, the magnitude of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al.
@@ -143,7 +141,7 @@ class _JointLoadFriction(_JointFriction):
 
 @EFFECTS.register("joint_presliding")
 class _JointPresliding(EffectBase):
-    """Dahl friction, which includes stiction: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
+    """Presliding friction of Dahl with stiction: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
 
     s depends on the path of the angle, not on time. Over a step of d = h v
 

@@ -17,6 +17,9 @@ from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
 from yid_ocp.model.parameters import Parameters
 
+# unit of a quantity at a prismatic joint, by its unit at a revolute joint
+_PRISMATIC_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg"}
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -87,10 +90,9 @@ class Joint:
     effort_limit: float = math.inf  # [N m or N]
     velocity_limit: float = math.inf  # [rad/s or m/s]
 
-    @property
-    def coordinate_unit(self) -> str:
-        """The unit of the joint's coordinate: `rad` or `m`."""
-        return "rad" if self.kind == "revolute" else "m"
+    def unit(self, revolute: str) -> str:
+        """Return the unit of a quantity of this joint, which is `revolute` for a revolute joint (N instead of N m)."""
+        return revolute if self.kind == "revolute" else _PRISMATIC_UNITS.get(revolute, revolute)
 
 
 @dataclass(frozen=True)

@@ -191,11 +191,10 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: StiffnessAndRest) -> tuple[Parameter, Parameter]:
     """Make the parameters `JOINT.stiffness` and `JOINT.rest` for the spring of a robot joint."""
-    unit = tree.joints[tree.joint_index(joint)].coordinate_unit
-    per = "N m/rad" if unit == "rad" else "N/m"
+    unit, rest = tree.joints[tree.joint_index(joint)].unit, f"where the spring on {joint} is relaxed"
     return (
-        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
-        Parameter(f"{joint}.rest", spring.rest_position, unit, description=f"where the spring on {joint} is relaxed"),
+        Parameter(f"{joint}.stiffness", spring.stiffness, unit("N m/rad"), 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.rest", spring.rest_position, unit("rad"), description=rest),
     )
 
 
@@ -231,12 +230,11 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
     known = 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD
     limit = joint.effort_limit if known else UNLIMITED_EFFORT_THRESHOLD
     gain = limit / _DEFAULT_FULL_TORQUE_ERROR if known else _DEFAULT_GAIN
-    torque, per = ("N m", "N m/rad") if joint.coordinate_unit == "rad" else ("N", "N/m")
     rows: tuple[tuple[str, float, str, float, float, str], ...] = (
-        ("gain", gain, per, 0.0, math.inf, "torque per error of the angle"),
-        ("damping", _DEFAULT_DAMPING_TIME * gain, per.replace("/", " s/"), 0.0, math.inf, "damping of the motion"),
+        ("gain", gain, joint.unit("N m/rad"), 0.0, math.inf, "torque per error of the angle"),
+        ("damping", _DEFAULT_DAMPING_TIME * gain, joint.unit("N m s/rad"), 0.0, math.inf, "damping of the motion"),
         ("delay", 0.0, "s", 0.0, _MAX_COMMAND_DELAY, "delay from a command to its torque"),
-        ("torque_limit", limit, torque, 1e-3, math.inf, "largest torque"),
+        ("torque_limit", limit, joint.unit("N m"), 1e-3, math.inf, "largest torque"),
     )
     return [
         Parameter(f"{joint.name}.servo_{name}", value, unit, lower, upper, f"{text}, servo of {joint.name}")
@@ -245,11 +243,10 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
 
 
 def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_FirmwareTerm, Parameter]:
-    angle = joint.coordinate_unit
-    rate, words = "N m s/rad" if angle == "rad" else "N s/m", f"servo of {joint.name}"
+    words = f"servo of {joint.name}"
     known = {
         "integral": ("1/s", 0.0, math.inf, f"integral over proportional gain, {words}"),
-        "derivative": (rate, 0.0, math.inf, f"damping within the limit of the duty cycle, {words}"),
-        "dead_band": (angle, 0.0, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
+        "derivative": (joint.unit("N m s/rad"), 0.0, math.inf, f"damping within the limit of the duty cycle, {words}"),
+        "dead_band": (joint.unit("rad"), 0.0, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
     }
     return {term: Parameter(f"{joint.name}.servo_{term}", 0.0, *known[term]) for term in dict.fromkeys(terms)}

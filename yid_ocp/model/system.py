@@ -292,9 +292,9 @@ class System(ReprMixin):
         damping, servos = options.get("damping", 0.0), options.get("servos")
         wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
         dampers = {
-            joint: Parameter(f"{joint}.damping", size, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
-            for joint, size in wanted.items()
-            if tree.joint_index(joint) >= 0  # raises `ModelError` if there is no such joint
+            joint: Parameter(f"{joint}.damping", wanted[joint], unit("N m s/rad"), 0.0, math.inf, f"damping of {joint}")
+            for joint in wanted  # `joint_index` raises `ModelError` if there is no such joint
+            for unit in [tree.joints[tree.joint_index(joint)].unit]
         }
         entries, elastic, segments = list(dampers.values()), list[ElasticJoint](), list[SingleSegmentLayout]()
         for joint, spring in options.get("springs", {}).items():

@@ -189,7 +189,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
     starts = mover.moved_joint_start_positions
     for name, at, low, high in zip(mover.step.system.prescribed, starts, search.lower, search.upper, strict=False):
         if not low <= 0.0 <= high:
-            unit = next(joint.coordinate_unit for joint in mover.step.system.mechanism.joints if joint.name == name)
+            unit = next(joint.unit("rad") for joint in mover.step.system.mechanism.joints if joint.name == name)
             what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
             where, hint = "plan.start_joint_positions", f"set plan.start_joint_positions.{name} within its limits"
             raise ConfigError(what, where=where, allowed=f"{at + low:.4g} to {at + high:.4g} {unit}", hint=hint)

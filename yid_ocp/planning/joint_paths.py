@@ -322,7 +322,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
     chosen = np.array([float(posture[name]) for name in system.prescribed])
     for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
-            unit = system.mechanism.joints[system.mechanism.joint_index(name)].coordinate_unit
+            unit = system.mechanism.joints[system.mechanism.joint_index(name)].unit("rad")
             over = max(low - value, value - high)
             what = f"joint {name} starts at {value:.4g} {unit}, which is {over:.3g} {unit} beyond its limit"
             allowed, hint = f"{low:.4g} to {high:.4g} {unit}", f"set {where}.{name} to a position within its limits"
@@ -359,7 +359,7 @@ def check_rest_effort_and_spring_limits(
     rows += [(i, "max_spring_angle", "an angle", rest.state[i], largest) for i in springs]
     for i, which, noun, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
-            unit = "rad" if noun == "an angle" else "N m" if joints[i].coordinate_unit == "rad" else "N"
+            unit = joints[i].unit("rad" if noun == "an angle" else "N m")
             over = f"{noun} of {value:.4g} {unit}, which is {abs(value) - limit:.3g} {unit} beyond its limit"
             what, where = f"{joints[i].name} at rest {when} has {over}", f"plan.limits.{which}"
             hint = f"raise {where} if the robot allows it, or set another plan.start_joint_positions or target"

@@ -263,9 +263,10 @@ def _joints(
         for values, std in ((position, angle_std), (effort, effort_std))
     )
     # constant over the recording, for every joint one draw
-    bias = np.zeros(len(names)) if bias_std is None else bias_std
-    effort = effort + _noisy(np.zeros(len(names)), bias, rng)
+    effort = effort + _noisy(np.zeros(len(names)), np.zeros(1) if bias_std is None else bias_std, rng)
     levels: dict[str, Any] = {"position_std": angle_std, "effort_std": effort_std, "effort_bias_std": bias_std}
+    if not system.driven and effort_std is None:
+        return JointGroup(names, episode.grid.node_times, position, position_std=angle_std)  # no fit could use efforts
     # for prescribed joints, the effort at the nodes
     kind: EffortSamplingKind = "command" if system.driven else "sample"
     return JointGroup(names, episode.grid.node_times, position, effort=effort, effort_kind=kind, **levels)

@@ -213,8 +213,8 @@ def smoothed_efforts_at_nodes(
     """Low-pass filter joint efforts and sample them at each node, (steps + 1, len(names)) [N m]. Raises `DataError`."""
     joints = recording.joints
     if joints is None or joints.effort is None:
-        what = "the effects series_elasticity and backlash need joint efforts, but the recording has none"
-        where, hint = f"recording '{recording.name}': joints/effort", "import efforts, or remove these model.effects"
+        what = "an effect of the model (series_elasticity or backlash) needs joint efforts, but the recording has none"
+        where, hint = f"recording '{recording.name}': joints/effort", "import efforts, or remove the effect"
         raise DataError(what, where=where, allowed="the effort of every joint", hint=hint)
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_column_indices(joints, names, recording.name)])
     # the mean of an interval belongs to its centre

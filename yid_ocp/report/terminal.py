@@ -122,9 +122,10 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
             rows.append((words, where, first["certainty"]))
             # the first issue is the strongest; its line counts if others give the same setting another value
             lines = {own["setting"].partition(":")[0]: own["setting"] for own in (*others[::-1], first)}
-            do += f" by {'these lines' if len(lines) > 1 else 'this line'} of the configuration:" if all(lines) else "."
+            options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
+            do += f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else "."
             text = f"{words}{f' ({where})' * (len(alike) > 1)}: {first['what']}. {do[0].upper()}{do[1:]}"
-            advice += [text, CodeBlock("\n".join(lines.values()))]
+            advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
@@ -188,9 +189,7 @@ def misfit_summary_blocks(
 
 def _start_value_advice(parameters: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a sentence on undetermined parameters that a poor fit left near their start, empty if there are none."""
-    lost = {
-        name: own for name, own in parameters.items() if own["verdict"] == "not_identifiable" and own.get("initial")
-    }
+    lost = {key: own for key, own in parameters.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
     said = f"First check size and unit of the start values of {names}: there the recordings do not depend on them, so "
@@ -209,11 +208,8 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     for key, words in kinds.items():
         tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
         moved = {name: own for name, own in tried.items() if abs(own[key]) > own["std"]}
-        worst = sorted(moved, key=lambda name: -abs(moved[name][key]) / moved[name]["std"])
-        changes = [
-            f"{n} by {moved[n][key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {moved[n]['std']:.2g})"
-            for n in worst
-        ]
+        worst = sorted(moved.items(), key=lambda item: -abs(item[1][key]) / item[1]["std"])
+        changes = [f"{n} by {e[key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {e['std']:.2g})" for n, e in worst]
         if moved:
             text = f"With {words}, these estimates would change by more than their ± from the recordings: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []

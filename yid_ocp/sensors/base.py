@@ -38,9 +38,7 @@ class SensorOptions:
     ] = None
     std: Annotated[
         _Positive | Mapping[str, _Positive] | None,
-        OptionInfo(
-            "noise standard deviation in place of the recorded one, by name if values differ", "m, rad, N m, ..."
-        ),
+        OptionInfo("noise standard deviation instead of the recorded one, by name if they differ", "m, rad, N m, ..."),
     ] = None
     frame_by_recorded_name: Annotated[
         Mapping[str, str],
@@ -177,7 +175,8 @@ class _RecordingData(Protocol):
 def missing_noise_level_error(noun: str, where: str, key: str, unit: str) -> DataError:
     """Return the error for a channel whose noise standard deviation is neither recorded nor in the settings."""
     what = f"the standard deviation of the noise of {noun} is neither recorded nor in the settings"
-    return DataError(what, where=where, allowed=f"a number above 0 [{unit}]", hint=f"set sensors.{key}.std: NUMBER")
+    allowed, hint = f"a number above 0 [{unit}]", f"set sensors.{key}.std, or sensors.{key}.use: false"
+    return DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[str, ...], where: str) -> list[int]:

@@ -441,13 +441,12 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
     native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
     able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
     for effect in system.effects:
-        aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
-        if aspects:
+        if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS:
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            allowed = ", ".join(own["is"] for name, own in elements_by_aspect_and_file_format().items() if name in able)
-            where, hint = f"effect '{effect.kind}@{effect.location}'", "leave the effect out of model.effects"
-            raise ModelError(what, where=where, allowed=f"effects that change {allowed}", hint=hint)
+            where, allowed = f"effect '{effect.kind}@{effect.location}'", "effects that docs/howto/export.md lists"
+            hint = "leave the effect out of model.effects or model.friction"
+            raise ModelError(what, where=where, allowed=allowed, hint=hint)
     for grasp in system.grasps:
         if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"

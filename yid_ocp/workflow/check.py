@@ -124,7 +124,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     rate = 1.0 / problem.step.time_step
     if arm is not None:
         recorded = 1.0 / median_sample_period(arm.t)
-        if recorded < 0.5 * rate:
+        if recorded < 0.49 * rate:  # more is the same up to rounding
             said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). The motion in "
             said += f"between is interpolated. If possible, record at {0.5 * rate:.4g} Hz or more"
             warnings.append(f"in '{episode.name}', joints are sampled at {said}")

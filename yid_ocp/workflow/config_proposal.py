@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period, noise_or_quantization_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
-from yid_ocp.errors import ConfigError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import joint_damping_and_friction, read_urdf, urdf_path_from_robot_name
@@ -270,8 +270,8 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
     if frame is None or standing:
         return arms[0].tool_frames[0], arms[0]
     if frame not in tree.frames:
-        allowed = ", ".join(name for arm in arms for name in arm.tool_frames)
-        said = unknown_name_error_arguments(frame, tree.frames) | {"allowed": allowed}
+        usual, near = [name for arm in arms for name in arm.tool_frames], nearest_name_question(frame, tree.frames)
+        said = unknown_name_error_arguments(frame, usual, near)
         raise ConfigError(f"there is no frame '{frame}'", where="--holder", **said)
     carried = tree.frames[frame].joint_index
     return frame, next((arm for arm in arms if carried >= 0 and tree.joint_names[carried] in arm.joints), arms[0])

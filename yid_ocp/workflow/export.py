@@ -118,7 +118,8 @@ class _CalibratedModel:
         # names of parameters start with that of their effect
         names = [n for n in self.parameter_values if "@" not in n or n.rpartition(".")[0] in kept]
         parameters = {key: said for key, said in run.parameters.items() if key in names or fnmatch.filter(names, key)}
-        return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
+        model = replace(run.model, effects=effects, friction=None)
+        return build_system(replace(run, model=model, parameters=parameters))
 
     def values_for(self, system: System) -> dict[str, float]:
         return {name: value for name, value in self.parameter_values.items() if name in system.parameters}
@@ -140,10 +141,13 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         what = "the result has no valid parameter values: another version wrote it, or it is damaged"
         raise DataError(what, where=where, allowed=allowed, hint=f"repeat {result.get('command', 'it')}") from error
     nominal = load_config(folder / "config.yaml")
+    by_label, added = run_history.group_parameter_values_by_effect_label, run_history.settings_with_added_effects
+    # a friction law becomes single effects, so that a file can lack one of them
+    nominal = added(nominal, by_label({entry.name: entry.value for entry in build_system(nominal).parameters}))
     doubtful = [n for n, own in parameters.items() if own.get("verdict") in ("not_identifiable", "not_trusted")]
+    doubtful += (result.get("to_use") or {}).get("left_out", ())  # of a diagnosis
     std = {n: None if n in doubtful else own.get("std") for n, own in parameters.items() if own.get("free")}
-    whole = run_history.settings_with_added_effects(nominal, run_history.group_parameter_values_by_effect_label(values))
-    return _CalibratedModel(whole, nominal, values, std)
+    return _CalibratedModel(added(nominal, by_label(values)), nominal, values, std)
 
 
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
@@ -240,7 +244,7 @@ def _expressible(
 ) -> tuple[System, dict[str, FeatureExportSupport]]:
     """Return the system without effects that a format cannot represent, and how the format represents each effect."""
     said = models.export_support_by_effect(full, calibrated.values_for(full), form)
-    for _ in range(len(said) + 1):
+    while True:
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
         kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]
         system = calibrated.system(kept)
@@ -258,7 +262,6 @@ def _expressible(
                 what = f"the model cannot be written as {form.upper()}: {error.what}"
                 hint = error.hint or f"another format: {', '.join(_MODEL_FORMATS)}"
                 raise ModelError(what, where=error.where, allowed=error.allowed, hint=hint) from error
-    raise AssertionError("effects run out")
 
 
 def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Progress) -> dict[str, Any]:

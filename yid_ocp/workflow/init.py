@@ -88,7 +88,8 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
     if (template := templates.get(word)) is None:
-        said = unknown_name_error_arguments(word, templates, "use --object cable for a rope, or leave --object out")
+        hint = "write --object cable for a rope, --object beam for a rod, or leave --object out"
+        said = unknown_name_error_arguments(word, templates, hint)
         raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     links = template.default_links if arguments.links is None else arguments.links
     if not 1 <= links <= 64:
@@ -202,17 +203,17 @@ def _summary_lines(
     told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
     lost = [f"warning: {text}" for text in told if "`init` leaves out" in text]
     for group, own in proposal.point_placements.items() if proposal.has_object else ():
-        if "." not in group and own and not any(place.frame for place in own):
+        if "." not in group and own and {place.frame for place in own} <= {"", proposal.holder_frame}:
             frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
-            lost.append(f"warning: `check` will stop, because no point of {group} has a frame. Set {frames} or {use}")
+            lost.append(
+                f"warning: no point of {group} is on the object (without a frame, `check` stops). Set {frames} or {use}"
+            )
     where = f" in the picture {out.with_suffix('.html')}" * has_picture
     head = f"`init` chose these settings. Check them{where}:"
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(
-            f"`diagnose` does not test these effects, because no recorded signal shows them: {', '.join(kinds)}."
-        )
+        lines.append(f"`diagnose` does not test these effects, as no recorded signal shows them: {', '.join(kinds)}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "

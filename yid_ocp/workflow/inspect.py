@@ -80,7 +80,7 @@ def _run_inspect(
         result = {
             "format": "yid-inspect/1",
             "variables": [
-                {"name": joint.name, "unit": joint.coordinate_unit, "role": roles.get(joint.name, "free")}
+                {"name": joint.name, "unit": joint.unit("rad"), "role": roles.get(joint.name, "free")}
                 for joint in step.system.mechanism.joints
             ],
             "parameters": {

@@ -101,6 +101,7 @@ class OpenBag:
                 hint = f"check it by `{tool} info {self.path}`; if it is sound, cut it into shorter bags"
             elif self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
                 what = "the bag cannot be read, because its folder has no metadata.yaml"
+                hint = f"name tables one by one; if the folder is a bag, {hint}"
             elif self.path.is_file() and not self.path.stat().st_size:
                 what, hint = "the bag cannot be read, because it is empty (0 bytes)", "copy it again from the recorder"
             allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
@@ -218,10 +219,8 @@ def _read_bag(
         said += "--pose-axis-point-distance 0.1 at the import keeps them as points 0.1 m away on the axes of each pose"
         more = (*more, said)
     others = (_preview_source(topic, bag, names) for topic in bag.file.topics if topic.name not in used)
-    left = [
-        f"{s.name} was left out ({s.n_samples} of {s.kind}): {'not selected' if s.imported_as else s.note}"
-        for s in others
-    ]
+    reasons = ((s, "not selected" if s.imported_as else s.note) for s in others)
+    left = [f"{s.name} was left out ({s.n_samples} of {s.kind}): {reason}" for s, reason in reasons]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, point_names=None))
