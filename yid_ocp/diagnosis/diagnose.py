@@ -439,7 +439,7 @@ def fit_nominal_model(
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
-    solution = solution or fit_problem(problem, composed.refit_solver or REFIT_SOLVER, verdicts=False)
+    solution = solution or fit_problem(problem, replace(REFIT_SOLVER, cost_tolerance=1e-8), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     composed = composed.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)

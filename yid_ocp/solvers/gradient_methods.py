@@ -95,7 +95,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             if not rejected:
                 slope = max_abs_projected_gradient(x, jacobian.T @ residual, lower, upper, size)
                 recorder.record_iterate(now.cost, x, slope)
-                patience = _PATIENCE_STEPS[self == self.with_coarse_tolerances]
+                patience = _PATIENCE_STEPS[self.step_tolerance >= 1e-3]
                 saved = _saved(problem, recorder.history, now, patience)
                 if saved is not None:
                     last = f"the last {patience} steps together lowered the cost by only {saved:.2g}"
