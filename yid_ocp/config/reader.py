@@ -313,7 +313,7 @@ class _Reader:
                 advice += f", converted from {match[2].strip()}"
         if isinstance(raw, dict) and options.variadic_tuple_entry_type(hint) is not None:
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
-        if isinstance(raw, str) and (choices := options.literal_choices(hint)):
+        if isinstance(raw, str) and not re.match(r"[-+.\d\s]", raw) and (choices := options.literal_choices(hint)):
             advice = f"choose an allowed value ({schema.option_info_from_annotation(hint).description})"
             advice = nearest_name_question(raw, choices) or advice
         shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and not {*",'"} & {*unit} else _shown(raw)
