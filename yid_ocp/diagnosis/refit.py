@@ -33,7 +33,6 @@ _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
 _MIN_LEFT_OUT_FOR_OWN_STEP = 800  # candidates, times refits, times recordings, which repay a step's compilation
-_MAX_KEPT_JACOBIAN = 2**21  # entries that each of several refits keeps; a larger one is computed again where needed
 _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
@@ -271,7 +270,7 @@ def _evaluated(
 
 def reevaluate_refit_with_all_candidates(problem: AllCandidatesProblem, fit: RefittedModel) -> RefittedModel:
     """Evaluate a refit again at its estimates, with the step of all candidates. Its other results are kept."""
-    if fit.problem.step is problem.problem.step and fit.evaluation.jacobian is not None:
+    if fit.problem.step is problem.problem.step:
         return fit
     own, finish = _evaluated(problem, fit.effects, fit.values)
     return replace(fit, problem=own, evaluation=finish, cost=finish.cost) if finish.ok else fit
@@ -390,8 +389,6 @@ def refit_with_each_effect(
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         fit = search.refit(effects, {**values, **entry[1]}, f"{join_effect_labels(effects)} {where}".strip())
         left = "failed" if fit is None else f"{fit.held_out_loss.chi2_per_sample:.4g} (best so far: {table()[1][1]})"
-        if isinstance(fit, RefittedModel) and fit.residual_count * len(fit.values) > _MAX_KEPT_JACOBIAN:
-            fit = replace(fit, evaluation=replace(fit.evaluation, jacobian=None))
         parts.count_done(f"held-out chi2/n with {label}: {left}", table)
         return fit
 
