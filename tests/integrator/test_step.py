@@ -167,8 +167,7 @@ def test_grasps_hold_what_they_should(parts, roll, violation, kind):
     path = np.tile(q[:6], (101, 1))
     # the clamp turns about its own axes
     path[:, 3:] += np.outer(1 - np.cos(np.linspace(0, np.pi, 101)), [0.05, -0.04, 0.08])
-    rollout = roll(step, theta, q, np.zeros(system.n_coordinates), 100, path=path)
-    end = rollout.state[-1, : system.n_coordinates]
+    end = roll(step, theta, q, np.zeros(system.n_coordinates), 100, path=path).state[-1, : system.n_coordinates]
     assert np.max(np.abs(violation(step, end, theta))) < 1e-10
     grasp = system.grasps[0]
     holder = parts.tip(system.mechanism, "clamp", end)

@@ -64,10 +64,7 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
     kept = []
     for begin, end in edges:
         part = None if t[end] - t[begin] < _MIN_PART_DURATION else recording.time_slice(float(t[begin]), float(t[end]))
-        if part is None:
-            continue
-        first = None if part.joints is None else part.joints.position[part.joints.t <= part.joints.t[0] + 0.2]
-        if begin == 0 or anywhere or (first is not None and np.ptp(first, axis=0).max() < _MAX_ROTATION_AT_REST):
+        if part is not None and (begin == 0 or anywhere or _begins_at_rest(part)):
             kept.append(part)
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
@@ -86,6 +83,12 @@ def _times(recording: Recording, driving: Sequence[str]) -> Array:
         if columns := [group.names.index(name) for name in driving if name in group.names]:
             return group.t[np.isfinite(group.position[:, columns]).all(axis=(1, 2))]
     return recording.points[0].t
+
+
+def _begins_at_rest(recording: Recording) -> bool:
+    if (joints := recording.joints) is None:
+        return False
+    return bool(np.ptp(joints.position[joints.t <= joints.t[0] + 0.2], axis=0).max() < _MAX_ROTATION_AT_REST)
 
 
 def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) -> Issue:

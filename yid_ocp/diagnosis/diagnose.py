@@ -282,9 +282,9 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
         return seen
     problem = replace(seen.with_events, problem=corrected)
     refitted = refit_with_effects(problem, fit.effects, fit.values)
-    gain = 0.0 if refitted is None else 2 * (fit.cost - refitted.cost)
-    if refitted is None or not gain > least:
+    if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return seen
+    gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
     seen.search.progress.begin_stage(said)
     return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
@@ -321,7 +321,7 @@ def _without_events(
         less = replace(first, problem=problem_corrected_for_events(first.problem, events))
         search.progress.begin_stage("fitting the nominal model without the events that were found", 3.0, 11.5)
         search, name = replace(search, problem=less), f"the nominal model without events, round {round_ + 1}"
-        smoothed, (old, before) = None, (nominal, events)  # the smoother's result includes the events
+        old, before, smoothed = nominal, events, None  # the smoother's result includes the events
         nominal = _fitted_nominal_model(search, old.values, name)
         moved = (abs(nominal.values[own] - old.values[own]) / max(std, 1e-300) for own, std in nominal.std.items())
         if max(moved, default=0.0) < _NEGLIGIBLE_MOVE_IN_STDS:  # the same events would be found again

@@ -397,9 +397,8 @@ def refit_with_each_effect(
     fits: list[RefitStatistics | None] = []
     # a batch is cheaper than single refits, which a deadline needs
     size = len(tried) if search.deadline == math.inf else 1
-    at_once = (
-        partial(map_with_merged_calls, questions_per_item=search.n_batched) if search.n_batched else map_in_threads
-    )
+    merged = partial(map_with_merged_calls, questions_per_item=search.n_batched)
+    at_once = merged if search.n_batched else map_in_threads
     for i in range(0, len(tried), size):
         if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
             break

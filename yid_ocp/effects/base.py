@@ -46,7 +46,8 @@ class ParameterDefinition:
         """The definition with bounds and range scaled for a location, and the unit of a prismatic joint there."""
         joint = next((joint for joint in system.mechanism.joints if joint.name == location), None)
         unit = self.unit if joint is None else joint.unit(self.unit)
-        scale, (low, high) = 1.0 if self.range_scale is None else self.range_scale(system, location), self.prior_range
+        scale = 1.0 if self.range_scale is None else self.range_scale(system, location)
+        low, high = self.prior_range
         lower, upper, prior = self.lower * scale, self.upper * scale, (low * scale, high * scale)
         return replace(self, unit=unit, lower=lower, upper=upper, prior_range=prior, range_scale=None)
 

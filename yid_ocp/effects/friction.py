@@ -63,7 +63,9 @@ class _JointFriction(EffectBase):
 
 def effect_with_sign_smoothing_speed(effect: Effect, speed: float | None) -> Effect:
     """Return a joint friction with the smoothing speed v_s = `speed` [rad/s]. Other effects are returned unchanged."""
-    return replace(effect, sign_smoothing_speed=speed) if speed and isinstance(effect, _JointFriction) else effect
+    if speed is None or not isinstance(effect, _JointFriction):
+        return effect
+    return replace(effect, sign_smoothing_speed=speed)
 
 
 def lower_smoothing_speed_to_joint_min(effect: EffectBase, system: System) -> EffectBase:

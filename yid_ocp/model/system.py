@@ -291,10 +291,10 @@ class System(ReprMixin):
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
         wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
+        damped = {name: tree.joints[tree.joint_index(name)] for name in wanted}  # raises `ModelError` if there is none
         dampers = {
-            joint: Parameter(f"{joint}.damping", wanted[joint], unit("N m s/rad"), 0.0, math.inf, f"damping of {joint}")
-            for joint in wanted  # `joint_index` raises `ModelError` if there is no such joint
-            for unit in [tree.joints[tree.joint_index(joint)].unit]
+            n: Parameter(f"{n}.damping", wanted[n], joint.unit("N m s/rad"), 0.0, math.inf, f"damping of {n}")
+            for n, joint in damped.items()
         }
         entries, elastic, segments = list(dampers.values()), list[ElasticJoint](), list[SingleSegmentLayout]()
         for joint, spring in options.get("springs", {}).items():

@@ -81,10 +81,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    order = (
-        "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the held-out"
+    order = "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the"
+    order += (
+        " held-out error beyond noise that the candidate removes (negative: adds). Values without ±: linear forecasts."
     )
-    order += " error beyond noise that the candidate removes (negative: adds). Values without ±: linear forecasts."
     yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
     yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""

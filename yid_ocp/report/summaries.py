@@ -78,9 +78,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = f"Do not use the values, because {said}: {result['message'].removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
         chi2 = 0.0 if failed else result["fit"]["chi2_per_dof"] or 0.0
-        said += f" With {chi2:.3g} times the chi2 of noise, first check units, signs and names." * (
-            chi2 > _HOPELESS_CHI2
-        )
+        if chi2 > _HOPELESS_CHI2:
+            said += f" With {chi2:.3g} times the chi2 of noise, first check units, signs and names."
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
@@ -441,9 +440,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if severe:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
     elif is_advised:
-        ended = (
-            f"`solve` can run, but its values may be wrong. First read the {'issues' if mild else 'warnings'} below."
-        )
+        ended = f"`solve` can run, but values may be wrong. First read the {'issues' if mild else 'warnings'} below."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])

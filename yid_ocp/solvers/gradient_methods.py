@@ -31,6 +31,7 @@ _LENGTH_AFTER_FAILURE = 0.25  # of the next step, over that of a rejected one wh
 # The search ends after this many steps (5 if coarse) that together lower the cost by at most this [units of noise] and
 # move no unknown by more than this [std], if the predicted decrease is at most the cost of a 95 % interval.
 _PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = (20, 5), 0.05, 0.1
+_COARSE_STEP_TOLERANCE = 1e-3
 _LOWEST = "the cost cannot be lowered any further"
 
 
@@ -64,7 +65,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
     @property
     def with_coarse_tolerances(self) -> GaussNewton:
         """This solver with looser step and cost tolerances, for preliminary searches."""
-        steps, costs = max(self.step_tolerance, 1e-3), max(self.cost_tolerance, 1e-5)
+        steps, costs = max(self.step_tolerance, _COARSE_STEP_TOLERANCE), max(self.cost_tolerance, 1e-5)
         return replace(self, step_tolerance=steps, cost_tolerance=costs)
 
     def minimize_cost(
@@ -93,9 +94,11 @@ class GaussNewton(base.SolverWithCheckedSettings):
             assert jacobian is not None
             size = np.maximum(np.abs(x), scale)
             if not rejected:
+                reduced = triangular_factor(jacobian, residual)
+                reduced[:, :-1] *= size
                 slope = max_abs_projected_gradient(x, jacobian.T @ residual, lower, upper, size)
                 recorder.record_iterate(now.cost, x, slope)
-                patience = _PATIENCE_STEPS[self.step_tolerance >= 1e-3]
+                patience = _PATIENCE_STEPS[self.step_tolerance >= _COARSE_STEP_TOLERANCE]
                 saved = _saved(problem, recorder.history, now, patience)
                 if saved is not None:
                     last = f"the last {patience} steps together lowered the cost by only {saved:.2g}"
@@ -107,8 +110,6 @@ class GaussNewton(base.SolverWithCheckedSettings):
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
-            reduced = triangular_factor(jacobian, residual)
-            reduced[:, :-1] *= size
             scaled, mu = _step_within_length(reduced, mu, low, (upper - x) / size, longest)
             step = size * scaled
             promised = predicted_cost_reduction_by_step(jacobian, residual, step)
