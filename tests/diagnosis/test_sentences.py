@@ -41,7 +41,7 @@ from sound_findings import assert_nothing_impossible_is_said
 from yid_ocp.diagnosis.baseline import (
     CounterfactualPredictionErrors,
     ParameterShiftsSinceBaseline,
-    _ParameterShift,
+    ParameterShift,
     _PredictionErrors,
 )
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
@@ -179,7 +179,7 @@ def compared():
     for name, (moved, shared, is_explained) in {
         "nothing changed": (False, 0.5, True), "one changed": (True, 0.5, True), "runs differ": (True, 1e-3, False),
     }.items():  # fmt: skip
-        shift = _ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, 1e-9, moved)
+        shift = ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, 1e-9, moved)
         earlier = ParameterShiftsSinceBaseline(is_explained, shared, (shift,))
         yield name, finding("no_gap", baseline_comparison=earlier, **NO_EFFECT)
     errors = [{"points.tip": (error, "m")} for error in (0.02, 0.01)]

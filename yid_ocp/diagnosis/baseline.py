@@ -42,7 +42,9 @@ _MIN_INFORMED_FRACTION = 0.05  # relative fall of a prior's variance, below whic
 
 
 @dataclass(frozen=True)
-class _ParameterShift:
+class ParameterShift:
+    """The change of a parameter since earlier runs, with a test of the hypothesis that nothing changed."""
+
     name: str
     unit: str
     baseline_value: float
@@ -53,6 +55,17 @@ class _ParameterShift:
     p_value: float  # p-value of the shift if nothing changed
     has_changed: bool  # significant at the diagnosis' level, Bonferroni-corrected for the parameters
 
+    @property
+    def text(self) -> str:
+        """A text with both values."""
+        before = value_and_uncertainty_text(self.baseline_value, self.baseline_std, least_digits=3)
+        now = value_and_uncertainty_text(self.current_value, self.current_std, least_digits=3)
+        return f"{self.name} from {before} to {now} {self.unit}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert the change to a dictionary."""
+        return attributes_to_dict(self, _SHIFT)
+
 
 @dataclass(frozen=True)
 class ParameterShiftsSinceBaseline:
@@ -60,34 +73,29 @@ class ParameterShiftsSinceBaseline:
 
     is_baseline_explained: bool  # whether the model explained the earlier runs' recordings
     between_runs_p_value: float  # p-value of the differences between earlier runs; 1 for a single run
-    parameter_shifts: tuple[_ParameterShift, ...]
+    parameter_shifts: tuple[ParameterShift, ...]
 
     @property
-    def significant_parameter_shifts(self) -> tuple[_ParameterShift, ...]:
+    def significant_parameter_shifts(self) -> tuple[ParameterShift, ...]:
         """The parameters that have changed significantly, with the largest shift in standard deviations first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: -abs(entry.z_score or 0.0)))
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the parameter changes to a dictionary, the entry `baseline` of `yid-diagnosis/2`."""
-        return {"parameters": {entry.name: attributes_to_dict(entry, _SHIFT) for entry in self.parameter_shifts}}
+        return {"parameters": {entry.name: entry.to_dict() for entry in self.parameter_shifts}}
 
-    def sentences(self, rivals: Sequence[str]) -> list[str]:
-        """Return sentences on the changes. Changes of the parameters `rivals` explain as much as effects."""
-        moved = list[str]()
-        for own in self.significant_parameter_shifts:
-            before = value_and_uncertainty_text(own.baseline_value, own.baseline_std, least_digits=3)
-            now = value_and_uncertainty_text(own.current_value, own.current_std, least_digits=3)
-            moved.append(f"{own.name} from {before} to {now} {own.unit}")
+    def sentences(self, *, has_rivals: bool) -> list[str]:
+        """Return sentences on the changes, unless larger ones explain as much as the effects: `has_rivals`."""
+        moved = [own.text for own in self.significant_parameter_shifts]
         changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
         changed += f"{listed(moved)}. If nothing was altered on purpose, find the cause before you use the values."
         p = self.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
         return texts_that_hold(
-            (moved, changed),
-            (not [*moved, *rivals], "No parameter differs significantly from the baseline (the earlier runs)."),
-            (rivals, f"A change of {listed(rivals)} since the baseline explains about as much as the effects."),
+            (moved and not has_rivals, changed),
+            (not moved and not has_rivals, "No parameter differs significantly from the baseline (the earlier runs)."),
             (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
             (not self.is_baseline_explained, small),
         )
@@ -157,7 +165,7 @@ class EarlierRunsBaseline:
                 score = (now - float(value)) / math.sqrt(variance)
                 p = float(2 * scipy.special.ndtr(-abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, own)
-            shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
+            shifts.append(ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def shifted_parameters_with_prior(self, fit: RefittedModel, limits: Thresholds) -> list[str]:

@@ -256,9 +256,12 @@ def _with_changed_parameters(
     if not released or distance > 1.0:
         return seen, judged
     if judged.accepted_selected_effects and distance > -1.0:
-        probability, rivals = judged.probability * select.relative_probability(distance), tuple(released)
-        more = replace(judged, verdict="confusable", probability=probability, confusable_parameter_changes=rivals)
-        return seen, more
+        shifts = earlier.parameter_shifts_of_fit(fit, search.thresholds)
+        assert shifts is not None  # the priors are those of earlier runs
+        rivals = tuple(own for own in shifts.parameter_shifts if own.name in released)
+        probability = judged.probability * select.relative_probability(distance)
+        more = replace(judged, verdict="confusable", probability=probability, rival_shifts=rivals)
+        return seen, replace(more, rival_probability=judged.probability - probability)
     with contextlib.suppress(SolverError):
         anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):

@@ -111,6 +111,10 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             ],
             "events": [event.to_dict() for event in self.events.disturbances],
             "next_experiment": self.next_experiment,
+            "rival_changes": {
+                "probability": self.rival_probability,
+                "parameters": {shift.name: shift.to_dict() for shift in self.rival_shifts},
+            },
             "statistics": diagnosis_decision_statistics(self),
             "summary": self.summary,
             "absorption": self.nominal_parameters_before_and_after,

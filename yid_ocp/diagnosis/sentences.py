@@ -65,7 +65,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += {"insufficient_data": [], "no_gap": _why_no_gap(result)}.get(result.verdict, _why_gap(result))
     text += [] if result.law is None else [result.law.sentence]
     text += [*(cut.sentence(step) for cut in result.truncated_recordings), *_bound_by_priors(result)]
-    text += [] if since is None else since.sentences(result.confusable_parameter_changes)
+    text += [] if since is None else since.sentences(has_rivals=bool(result.rival_shifts))
     text += [] if result.counterfactual is None else result.counterfactual.sentences
     text += [note for note, _ in notes]
     text += result.events.overspeed_sentences(result.thresholds.max_joint_speed)
@@ -99,6 +99,11 @@ def _lead(result: DiagnosisResult) -> str:
     names = listed([effect.label for effect in result.accepted_effects])
     causes = " and ".join("".join(_said((own[1:], "one of "), (own, listed(own)))) for own in _rivals(result))
     probable = f"With {100 * result.probability:.0f} % probability, the true cause is {causes}."
+    moved = listed([shift.text for shift in result.rival_shifts])
+    since = f"With {100 * result.rival_probability:.0f} % probability, no effect is missing, but parameters have "
+    since += f"changed since the baseline: {moved}."
+    ordered = [probable, since] if result.probability > result.rival_probability else [since, probable]
+    probable = " ".join(ordered) if result.rival_shifts else probable
     none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from yid_ocp.diagnosis.baseline import ParameterShift
 from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import SelectedEffect, select_effects, total_gap_closure
@@ -91,7 +92,8 @@ class Judgement:
     explained_fraction: float  # decrease of r'r by the effects over its excess over noise
     transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
-    confusable_parameter_changes: tuple[str, ...]  # changes since a baseline that explain as much as the effects
+    rival_shifts: tuple[ParameterShift, ...]  # since a baseline, which explain about as much as the effects
+    rival_probability: float  # that these shifts are the cause
 
     @property
     def closure_by_selected_effects(self) -> null_test.HeldOutGapClosure:
@@ -152,7 +154,7 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         apart = {own.parameter: own.significant_disagreement_as_std for own in carried}
         std = {name: max(std, beside.get(name, 0.0), apart.get(name, 0.0)) for name, std in last.std.items()}
         added = (*added[:-1], replace(added[-1], refitted_model=replace(last, std=std)))
-    said = Judgement("", "", fits, added, explained, carried, 0.0, ())
+    said = Judgement("", "", fits, added, explained, carried, 0.0, (), 0.0)
     reasons = _reasons_against(said, limits)
     reason = next((name for name, holds in reasons.items() if holds), "")
     # a gap that is seen only along a candidate's signature counts only with an accepted effect

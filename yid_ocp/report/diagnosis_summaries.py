@@ -96,12 +96,14 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
     yield f"No recording has these signals, so their effects were not tried: {', '.join(lacking)}." if lacking else ""
-    rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
+    beside = " (with the effects)" if result.get("rival_changes", {}).get("parameters") else ""
+    rows = [("parameter", "baseline", f"now{beside}", "unit", "moved by", "verdict")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
         moved = "no information" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     yield SummaryTable(rows, "Since the baseline")
+    yield "moved by: change, in standard deviations that it has if nothing changed." if rows[1:] else ""
     rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]
     for key, made in (("removed", "without the effects"), ("added", "with the effects")):
         for channel, entry in (result.get("counterfactual") or {}).get(key, {"rmse": {}})["rmse"].items():
