@@ -40,8 +40,8 @@ from sound_findings import assert_nothing_impossible_is_said
 
 from yid_ocp.diagnosis.baseline import (
     CounterfactualPredictionErrors,
-    ParameterShiftsSinceBaseline,
     ParameterShift,
+    ParameterShiftsSinceBaseline,
     _PredictionErrors,
 )
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
