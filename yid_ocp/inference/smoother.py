@@ -217,8 +217,11 @@ class _State:
     def largest_evidences(self, sources: _Groups) -> list[tuple[float, float]]:
         """Result of `_largest_evidence` for each of several groups, added alone to the groups of these variances."""
         if new := [source for source in sources if source not in self.larger]:
-            filtered = map_in_threads(partial(_filtered, self.variance), self.models)
-            self.larger.update(zip(new, map_in_threads(partial(_largest_evidence, filtered), new), strict=True))
+            bases, parts = zip(*map_in_threads(partial(_responses, self.variance, new), self.models), strict=True)
+            reached = [(-math.inf, _VARIANCE_BOUNDS[0])] * len(new)
+            if all(math.isfinite(base.log_determinant) for base in bases):
+                reached = map_in_threads(partial(_largest_evidence, bases), zip(*parts, strict=True))
+            self.larger.update(zip(new, reached, strict=True))
         return [self.larger[source] for source in sources]
 
 
@@ -336,18 +339,24 @@ def _response_products(base: _Filtered, chosen: IntArray, correlation: float) ->
     return information, pull
 
 
-def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) -> tuple[float, float]:
+def _responses(
+    variance: _Variances, sources: _Groups, model: ResidualStateSpaceModel
+) -> tuple[_Filtered, list[tuple[Array, Array]]]:
+    """Filter of one recording, without its updates, which are too large to be kept, and products for each group."""
+    base, found = _filtered(variance, model), []
+    for source in sources if base.updates else ():
+        chosen = np.flatnonzero([own == source for own in model.unknown_groups])
+        found.append(_response_products(base, chosen, model.interval_correlation))
+    return replace(base, updates=()), found
+
+
+def _largest_evidence(bases: Sequence[_Filtered], parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     """Largest log evidence over the variance s^2 of one additional group, and this variance.
 
     With W the innovations caused by the group, those of the base have the covariance I + s^2 W W' (Woodbury identity).
+    `parts` are W'W and W'V of every recording.
     """
     products, log_determinant = np.sum([b.products for b in bases], axis=0), sum(b.log_determinant for b in bases)
-    if math.isinf(log_determinant):
-        return -math.inf, _VARIANCE_BOUNDS[0]
-    parts = []
-    for base in bases:
-        chosen = np.flatnonzero([own == source for own in base.model.unknown_groups])
-        parts.append(_response_products(base, chosen, base.model.interval_correlation))
 
     def cost(exponent: float) -> float:
         variance, left, determinant = 10.0**exponent, products, log_determinant
