@@ -118,18 +118,17 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
 
 
 def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
-    ensemble, composed = drawn(), AllCandidatesProblem("by the sensors", (DAMPER,), False)
-    weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
-    columns = {"by the sensors": [[1.0]], "by all noise": [[2.0]]}
+    ensemble, truth = drawn(), {"k": 1.0}
+    whitened = AllCandidatesProblem("by all noise", (DAMPER,), False)
+    composed = SimpleNamespace(with_whitening_linearized_at=lambda at: whitened if at is truth else None)
 
     def linearized(of, base, values):
-        return SimpleNamespace(signatures=[signature(DAMPER, columns[of.problem])])
+        return SimpleNamespace(signatures=[signature(DAMPER, [[2.0]])] if (of, values) == (whitened, truth) else [])
 
     monkeypatch.setattr(module, "EstimationProblem", lambda *_: problem())
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
-    monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", linearized)
-    [(of, _, factor)] = BlindCaseGenerator(ensemble.problem, 3, None)._detectable_candidates([], None)
+    [(of, _, factor)] = BlindCaseGenerator(ensemble.problem, 3, None)._detectable_candidates(truth, [], None)
     assert (of, np.abs(factor)) == (DAMPER, 2.0)
 
 

@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, linearize_candidates
-from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
 from yid_ocp.errors import ConfigError, DataError, ModelError, YidError
 from yid_ocp.inference.null_test import held_out_gap_closure
@@ -212,7 +212,6 @@ class BlindCaseGenerator:
         seed: int,
         finer: Callable[[int], System] | None = None,
         candidates: CandidateNamesOrAll = "all",
-        limits: Thresholds = DEFAULT_THRESHOLDS,
         *,
         simulated_system: System | None = None,
         conditions: SyntheticRecordingConditions | None = None,
@@ -222,7 +221,7 @@ class BlindCaseGenerator:
             what, allowed = "the arms have prescribed joints, or no driven ones", "driven joints alone"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         self.problem, self.seed, self._finer = problem, seed, finer
-        self._candidates, self._limits = candidates, limits
+        self._candidates = candidates
         recording = problem.episodes[0].recording
         self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.camera_pose is not None for group in recording.points)
@@ -289,14 +288,14 @@ class BlindCaseGenerator:
         options = replace(nominal.options, path_cutoff=cutoff)
         return EstimationProblem(nominal.step, list(recordings), nominal.free, options, values)
 
-    def _detectable_candidates(self, clean: Sequence[Recording], held_out: Recording) -> list[_Detectable]:
-        """Return every candidate with its sensitivity on recordings without effects."""
+    def _detectable_candidates(
+        self, truth: Mapping[str, float], clean: Sequence[Recording], held_out: Recording
+    ) -> list[_Detectable]:
+        """Return every candidate with its sensitivity at the parameters `truth` of recordings without effects."""
         problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [held_out])
-        nominal = fit_nominal_model(problem, composed, limits=self._limits)
-        # whitened by all noise, including torque noise
-        point = linearize_candidates(replace(composed, problem=nominal.problem), (), nominal.values)
+        point = linearize_candidates(composed.with_whitening_linearized_at(truth), (), truth)
         return [
             (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
             for s in point.signatures
@@ -343,7 +342,7 @@ class BlindCaseGenerator:
             return (self._outside(rng),), None
         size = _DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
         *clean, held_out = self._case_recordings(wanted, truth, (), attempt)
-        detectable = self._detectable_candidates(clean, held_out)
+        detectable = self._detectable_candidates(truth, clean, held_out)
         drawn = [_inside(detectable, rng, size) for _ in range(2 if wanted.category == "pair" else 1)]
         labels = [effect.label for effect, _ in drawn]
         return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]

@@ -95,6 +95,8 @@ def linearize_candidates(
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
+    if not tried:
+        return ProjectedCandidatesLinearization(np.zeros(0), ())
     placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.pack_unknowns(values))[rows.data]
@@ -104,11 +106,15 @@ def linearize_candidates(
     redrawn = [null_test.episodes_with_noisier_motion(placed, rng) for _ in draws]
     # changes by encoder noise hardly depend on the effects in the model
     known = problem.changes_by_encoder_noise
-    residual, warm, signatures = np.zeros(0), None, list[_EffectSignature]()
+    fitted = dict(zip(placed.unknown_names, placed.pack_unknowns(values).tolist(), strict=True))
+    held = placed.with_parameter_values({name: fitted[name] for name in placed.shared_parameters})
+    grid, sensitivities, warm = [], list[Array](), None
     for point, shapes in enumerate(itertools.zip_longest(*map(_shape_grid, tried))):
         chosen = [(effect, shape) for effect, shape in zip(tried, shapes, strict=True) if shape is not None]
         amplitudes = [name for effect, _ in chosen for name in effect.amplitude_parameter_names]
-        trial = placed.with_free_parameters_without_recompiling((*placed.free, *amplitudes))
+        # where amplitudes are neutral, other shapes change nothing but the derivatives by these amplitudes
+        free = placed.local_parameters if point else placed.free
+        trial = held.with_free_parameters_without_recompiling((*free, *amplitudes))
         trial = trial.with_parameter_values({name: value for _, shape in chosen for name, value in shape.items()})
         evaluation = trial.evaluate(trial.pack_unknowns(values), equilibrium_guesses=warm)
         if not evaluation.ok:
@@ -116,37 +122,62 @@ def linearize_candidates(
         warm = evaluation.equilibrium_guesses
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large
-        places = [trial.unknown_names.index(name) for name in amplitudes]
-        others = [name for name in trial.unknown_names if name not in amplitudes]
-        basis, follow = orthonormal_basis_and_coefficients(np.delete(jacobian, places, axis=1), jacobian[:, places])
-        residual, moved = (part - basis @ (basis.T @ part) for part in (data, jacobian[:, places]))
-        edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         if point not in known:
-            names = amplitudes if point else trial.unknown_names  # other shapes change nothing else
+            names = amplitudes if point else trial.unknown_names
             changed = (_changes(trial.with_episodes(own, ()), values, data, jacobian, names) for own in redrawn)
             known[point] = [(change * ~is_in_scatter, by_name) for change, by_name in filter(None, changed)]
-        errors, shifts = [], []
-        for (_, first), (error, own) in zip(known[0], known[point], strict=False):
+        places = [trial.unknown_names.index(name) for name in amplitudes]
+        if not point:
+            residual, others = data, [name for name in trial.unknown_names if name not in amplitudes]
+            nominal = np.delete(jacobian, places, axis=1)
+        sensitivities.append(np.zeros((len(residual), len(places))))
+        sensitivities[-1][rows.data] = jacobian[rows.data][:, places]
+        grid.append((chosen, amplitudes))
+    basis, followed = orthonormal_basis_and_coefficients(nominal, np.hstack(sensitivities))
+    del nominal, jacobian
+    residual, signatures = residual - basis @ (basis.T @ residual), list[_EffectSignature]()
+    follows = np.split(followed, np.cumsum([own.shape[1] for own in sensitivities])[:-1], axis=1)
+    for point, ((chosen, amplitudes), follow) in enumerate(zip(grid, follows, strict=True)):
+        moved = sensitivities[point] - basis @ (basis.T @ sensitivities[point])
+        by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
+        shifts, errors = list[Array](), [error for error, _ in known[point]]
+        for error, (_, first), (_, own) in zip(errors, known[0], known[point], strict=False):
             changes, unmoved = first | own, np.zeros_like(error)
             by_own, by_others = (np.stack([changes.get(n, unmoved) for n in part], 1) for part in (amplitudes, others))
             # the part of a signature that free parameters explain changes with their own signatures
             shift = np.zeros_like(moved)
             shift[rows.data] = by_own - by_others @ follow
             shifts.append(shift - basis @ (basis.T @ shift))
-            errors.append(error)
-        by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
+        edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
         split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_base, *shifts))
         for (effect, shape), (columns, changes, *shifted) in zip(chosen, zip(*split, strict=True), strict=True):
-            driven = columns[rows.data].T @ scatter
-            priors = columns[rows.stated_priors] / problem.problem.options.stated_std_factor
-            by_priors = priors.T @ priors
-            noise = null_test.covariance_of_scores(columns, series) + driven @ driven.T + by_priors
-            bias = np.zeros(columns.shape[1])
-            for own, error in zip(shifted, errors, strict=True):
-                noise += null_test.covariance_of_scores(own, series) / len(errors) ** 2
-                bias += own[rows.data].T @ error / len(errors)
-            signatures.append(_EffectSignature(effect, shape, columns, noise, by_priors, bias, changes))
+            pairs = [*zip(shifted, errors, strict=False)]
+            of_score = _covariance_and_bias_of_score(problem.problem, series, columns, scatter, pairs)
+            signatures.append(_EffectSignature(effect, shape, columns, *of_score, changes))
     return ProjectedCandidatesLinearization(residual, tuple(signatures))
+
+
+def _covariance_and_bias_of_score(
+    problem: EstimationProblem,
+    series: Sequence[OutputResidualIndices],
+    columns: Array,
+    scatter: Array,
+    changes: Sequence[tuple[Array, Array]],
+) -> tuple[Array, Array, Array]:
+    """Covariance of X'r for the `columns` X, the part of it by stated priors, and bias, see `_EffectSignature`.
+
+    `changes` are those of X and of the data's r by redrawn encoder noise, `scatter` a factor of the covariance of r.
+    """
+    rows = problem.residual_rows
+    driven = columns[rows.data].T @ scatter
+    priors = columns[rows.stated_priors] / problem.options.stated_std_factor
+    by_priors = priors.T @ priors
+    noise = null_test.covariance_of_scores(columns, series) + driven @ driven.T + by_priors
+    bias = np.zeros(columns.shape[1])
+    for own, error in changes:
+        noise += null_test.covariance_of_scores(own, series) / len(changes) ** 2
+        bias += own[rows.data].T @ error / len(changes)
+    return noise, by_priors, bias
 
 
 def _changes(

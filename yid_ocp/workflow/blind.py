@@ -428,7 +428,6 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
         experiment.seed,
         (lambda times: build_system(simulated_run, times)) if simulated.segment_layouts else None,
         run.diagnosis.candidates,
-        run.diagnosis,
         simulated_system=simulated,
         conditions=experiment._recording_conditions(),
     )
