@@ -12,7 +12,6 @@ from yid_ocp.analysis.estimation import channel_or_group_unit
 from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
-    MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
@@ -47,11 +46,14 @@ _BASELINE_DESCRIPTIONS = {
     "moves_with_clamps": "every point moves like the mean of the clamps that hold the cable",
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
-_MAX_DIRECTIONS = 8
+_MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
+_MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
+_MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
+_EQUATION_HEADS = "equations", "observed", "measured by"
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
@@ -264,12 +266,13 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± with initial state and grasps estimated too", "± with all else known")
+    start = "initial state and grasps" if result.get("has_grasps", True) else "initial state"
+    unsure = ("± [of the value]", f"± with {start} estimated too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = ("∞" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
+        spread = map(_relative_std_text, stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -280,24 +283,34 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
-    start = "No fit was made: at the initial values, " * is_initial
+    begun = "No fit was made: at the initial values, " * is_initial
     doubt = f" Only weakly determined: {abbreviated_names_text(weak)}." * bool(weak)
-    yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
+    yield SummaryStatement(f"{failed}{begun}{said}.{doubt}", "conclusion")
     if (std := result.get("grasp_std")) is not None:
         told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
+    said = "The ± leave out the error by the finite time step and number of links, which those of `solve` include."
+    yield "" if is_initial else said
+    is_poor = result["fit"] is not None and not result["fit"]["explains"]
+    doubtful = "the model does not explain the recordings" if is_poor else "a recording has a severe issue"
     meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
+    meanings["in doubt"] = f"{doubtful}, so the value may be wrong even if its ± is small"
     yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
-    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    yield from _combination_blocks(hidden[:_MAX_DIRECTIONS])
-    if len(hidden) > _MAX_DIRECTIONS:
-        yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
+    yield from _undetermined_combinations(hidden[:_MAX_DIRECTIONS])
+    changes = [*_weak_combined_changes(result["directions"])]
+    values = "initial values" if is_initial else "values of the fit"
+    said = "Some parameters can be exchanged for each other: the recordings hardly show the changes of a line together "
+    said += f"(one standard deviation, in % of the {values}). Measure the first parameter in another way and fix it."
+    yield said if changes else ""
+    yield SummaryTable([("change that the recordings hardly show",), *changes[:_MAX_DIRECTIONS]], "Combined changes")
+    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(changes[_MAX_DIRECTIONS:])) > 0:
+        yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         said = "No set of up to three changes makes it possible to find all parameters."
@@ -317,6 +330,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
     steps = {"fit, for estimates with intervals": "identifiability"} if is_initial else {}
+    steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
     more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
@@ -331,21 +345,33 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield next_steps_table(result, steps)
 
 
-def _combination_blocks(texts: Sequence[str]) -> SummaryBlockOrTextIterator:
-    """Yield sentences on combinations of parameters that cannot be found, by cause, and a table of the weak ones."""
+def _relative_std_text(std: float | None) -> str:
+    """Return a relative standard deviation in percent. One above a limit does not read as the limit."""
+    if std is None or std >= 10:
+        return "∞" if std is None else "above 1000 %"
+    return f"{100 * std:.3g} %" if 0.1 < std < 0.11 else f"{percent_number_text(std)} %"
+
+
+def _undetermined_combinations(texts: Sequence[str]) -> Iterator[str]:
+    """Yield sentences on combinations of parameters that cannot be found. Those of one cause share a sentence."""
     alike = dict[str, list[str]]()
-    rows: TableRows = [("combined change of parameters", "± of this combined change")]
     for text in texts:
-        what, _, spread = text.removesuffix(")").partition(" is determined only weakly (± ")
-        change, _, cause = what.removeprefix("these recordings cannot distinguish ").partition(" from ")
-        if spread:
-            rows.append((what.removeprefix("a change of "), spread))
-        else:
-            alike.setdefault(cause or change, []).append(change)
+        change, _, cause = text.removeprefix("these recordings cannot distinguish ").partition(" from ")
+        alike.setdefault(cause or change, []).append(change)
     for cause, changes in alike.items():
         named = f"These recordings cannot distinguish {', or '.join(changes)} from {cause}."
         yield named if changes != [cause] else f"{cause}."
-    yield SummaryTable(rows, "Weakly determined combinations")
+
+
+def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str]]:
+    """Yield table rows with the changes of several parameters together that the recordings determine only weakly."""
+    for entry in directions:
+        changes = {name: entry["std_relative"] * part for name, part in entry["components"].items()}
+        order = sorted(changes, key=lambda name: -abs(changes[name]))
+        named = [name for name in order if abs(changes[name]) > _MIN_NAMED_SHARE * abs(changes[order[0]])]
+        if entry["verdict"] == "weak" and len(named) > 1:
+            signs = {name: "-" if changes[name] < 0 else "+" for name in named[:_MAX_CHANGES]}
+            yield (", ".join(f"{n} {sign}{percent_number_text(abs(changes[n]))} %" for n, sign in signs.items()),)
 
 
 @register_summary("yid-plan/1")
@@ -498,24 +524,27 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
+    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
+    hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
+    text = "Every free parameter changes the readings by more than noise. `yid-ocp identifiability` tells whether they "
+    text += "can be told apart."
+    if hidden:
+        text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
+        text += "noise hides a change of 10 %. `yid-ocp identifiability` tests this after a fit."
+    yield SummaryStatement(text if changes else "", "conclusion")
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
-    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
-    values = {n: abs(result["parameters"][n]["value"]) for n in changes}
-    lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
-    text = f"At the initial values and starts of motion, the recordings tell nothing of {abbreviated_names_text(lost)} "
-    text += f"(± above {MAX_WEAK_RELATIVE_STD:g} times the value). `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if lost else "Every free parameter changes a reading." * bool(changes), "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
     said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    begun = f" Of one reading, it is the largest within {seconds:.2g} s of equilibrium." if seconds else ""
-    text = "The table has the equations of a time step that contain a parameter (del: motion of a coordinate, p1: its "
-    text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
-    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std).{begun}"
+    within = f"; of one reading: within {seconds:.2g} s of equilibrium" if seconds else ""
+    text = "The table has how far a change of each parameter (10 %, or one unit if zero) changes the readings, in standard"
+    text += " deviations of their noise (of all readings: root of the sum of squares, and noise does not hide "
+    text += f"{_MIN_VISIBLE_CHANGE} or more{within}). Equations: those of a time step that contain the parameter (del: "
+    yield f"{text}motion of a coordinate, p1: its momentum after the step). Observed: those that change a reading."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
     yield f"{left} more free parameters are in result.json." if left > 0 and not result["asked"] else ""
@@ -527,33 +556,35 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
-    for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
-        parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
-        yield SummaryTable([(head, "size", "first entry", "meaning"), *parts], head.capitalize())
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
     files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
     yield f"The folder has equations.txt (all equations and names), {files}."
-    yield next_steps_table(result, {"show which can be found together": "identifiability"} if changes else {})
+    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield the equations with each named (else each free) parameter, and the change of readings by one unit of it."""
+    """Yield the equations with each named (else each free) parameter, and how its change changes the readings."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
-    yield *head, "change of one reading [std]", "change of all readings [std]"
+    yield "parameter", "change", "all readings [std]", "one reading [std]", "best sensor", *_EQUATION_HEADS
     for name in dict.fromkeys(result["asked"] or shown):
-        own = known[name]
+        own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
         observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else observed
-        moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
-        changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
-        sensors = own["best"], ", ".join(own["read"])
-        yield name, own["unit"], str(len(rows)), _row_names_text(rows), sight, *sensors, *changes
+        moves = [None if own[key] is None else own[key] * change for key in ("along", "moved")]
+        small = f"< {_NEGLIGIBLE_STDS:g}"
+        sizes = ["" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves]
+        cells = *sizes, own["best"], _row_names_text(rows), sight, ", ".join(own["read"])
+        yield name, f"{change:.3g} {own['unit']}", *cells
+
+
+def _shown_change(parameter: Mapping[str, Any]) -> float:
+    """Return the change of a parameter for which `inspect` shows the change of readings: 10 %, or one unit if zero."""
+    return abs(parameter["value"]) / 10 or 1.0
 
 
 def _row_names_text(names: Sequence[str]) -> str:

@@ -160,6 +160,7 @@ def _identifiability_result(
         "message": "judged at the initial values" if solution is None else solution.message,
         "at": asked.evaluation_point,
         "start": asked.start_knowledge,
+        "has_grasps": bool(problem.system.grasps),
         "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
         "issues": issues_to_plain_data(problem.options.data_issues),

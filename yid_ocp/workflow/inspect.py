@@ -88,10 +88,6 @@ def _run_inspect(
                 for entry in parameters
             },
             "equations": step_diagnostics.step_complexity_summary(step),
-            "blocks": {
-                kind: [attributes_to_dict(block, "name meaning names=full_names") for block in own if block.labels]
-                for kind, own in (("rows", symbols.row_blocks), ("columns", symbols.column_blocks))
-            },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
