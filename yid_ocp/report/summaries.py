@@ -541,8 +541,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
     within = f"; of one reading: within {seconds:.2g} s of equilibrium" if seconds else ""
-    text = "The table has how far a change of each parameter (10 %, or one unit if zero) changes the readings, in standard"
-    text += " deviations of their noise (of all readings: root of the sum of squares, and noise does not hide "
+    text = "The table has how far a change of each parameter (10 %, or one unit if zero) changes the readings, in "
+    text += "standard deviations of their noise (of all readings: root of the sum of squares, and noise does not hide "
     text += f"{_MIN_VISIBLE_CHANGE} or more{within}). Equations: those of a time step that contain the parameter (del: "
     yield f"{text}motion of a coordinate, p1: its momentum after the step). Observed: those that change a reading."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
