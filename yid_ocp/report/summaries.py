@@ -397,7 +397,8 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
-    steps = ({} if result["from"]["run"] else steps) | (record if result["goal"] == "information" else {})
+    steps = {} if result["from"]["run"] or is_hopeless else steps
+    steps |= record if result["goal"] == "information" else {}
     yield next_steps_table(result, longer if not is_usable and said != done else steps)
 
 

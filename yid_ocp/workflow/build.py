@@ -83,7 +83,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
     if robot is None and not objects:
         what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
-        raise run.config_error(what, "model", allowed=allowed, hint="set model.robot or model.object")
+        hint = "set model.robot or model.object" + ("" if run.key_locations else "; the configuration is empty")
+        raise run.config_error(what, "model", allowed=allowed, hint=hint)
     with add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot, [item for item, *_ in objects])
     with add_setting_location_to_errors(run, "model", "object", "mount", "parent_frame"):

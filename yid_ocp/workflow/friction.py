@@ -32,6 +32,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
     said = run.model.friction or FrictionLawSettings(law="viscous")
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
+        progress.begin_stage("building the models of the friction laws")
         fits: list[CrossValidatedFrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
         by_law = {

@@ -228,7 +228,7 @@ class _IdentifiabilityTasks:
         named = [[change.name for change in changes] for changes in sets]
         own = {name: [named[i] for i in members] for name, members in groups.items()}
         tasks = {name: {"sets": members, "inflation": inflation} for name, members in own.items()}
-        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'changed experiment')}")
+        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'experiment')}")
         done = self._done(_change_set_outcomes, tasks)
         order = [i for members in groups.values() for i in members]
         found = [dataclass_from_plain_data(ChangedExperimentResult, entry) for told in done for entry in told]

@@ -149,7 +149,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         names = {name: name for name in group.names}
         if options.joints is not None:
             names = parse_old_to_new_joint_names(options.joints, where)
-            require_known_names(names, group.names, "joint", where, DataError)
+            require_known_names(names, group.names, "joint", f"--joints, {where}", DataError)
         at, recorded = [group.names.index(name) for name in names], group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
         if "effort" in channels:
