@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
@@ -49,11 +49,9 @@ _BASELINE_DESCRIPTIONS = {
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
-_MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
 _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
-_EQUATION_HEADS = "equations", "observed", "measured by"
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
@@ -266,13 +264,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    start = "initial state and grasps" if result.get("has_grasps", True) else "initial state"
-    unsure = ("± [of the value]", f"± with {start} estimated too", "± with all else known")
+    unsure = ("± [of the value]", "± with initial state (and any grasps) estimated too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = map(_relative_std_text, stds)
+        spread = ("∞" if s is None else f"{100 * s:.3g} %" if s < 9.995 else "above 1000 %" for s in stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -283,16 +280,15 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
-    begun = "No fit was made: at the initial values, " * is_initial
+    start = "No fit was made: at the initial values, " * is_initial
     doubt = f" Only weakly determined: {abbreviated_names_text(weak)}." * bool(weak)
-    yield SummaryStatement(f"{failed}{begun}{said}.{doubt}", "conclusion")
+    yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
     if (std := result.get("grasp_std")) is not None:
         told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    said = "The ± leave out the error by the finite time step and number of links, which those of `solve` include."
-    yield "" if is_initial else said
+    yield "The ± leave out the error of simulation (time step, number of links), which `solve` adds." * (not is_initial)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
     doubtful = "the model does not explain the recordings" if is_poor else "a recording has a severe issue"
     meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
@@ -302,14 +298,18 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    yield from _undetermined_combinations(hidden[:_MAX_DIRECTIONS])
-    changes = [*_weak_combined_changes(result["directions"])]
-    values = "initial values" if is_initial else "values of the fit"
+    shown = (words.removeprefix("these recordings cannot distinguish ") for words in hidden[:_MAX_DIRECTIONS])
+    parts = (words.partition(" from ") for words in shown)
+    for cause, own in grouped((cause or change, change) for change, _, cause in parts).items():
+        said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
+        yield said if own != [cause] else f"{cause}."
+    weak_changes = [*_weak_combined_changes(result["directions"])]
     said = "Some parameters can be exchanged for each other: the recordings hardly show the changes of a line together "
-    said += f"(one standard deviation, in % of the {values}). Measure the first parameter in another way and fix it."
-    yield said if changes else ""
-    yield SummaryTable([("change that the recordings hardly show",), *changes[:_MAX_DIRECTIONS]], "Combined changes")
-    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(changes[_MAX_DIRECTIONS:])) > 0:
+    said += "(one standard deviation, in % of the last value of each). Measure the first parameter in another way and fix it."
+    yield said if weak_changes else ""
+    rows = [("change that the recordings hardly show",), *weak_changes[:_MAX_DIRECTIONS]]
+    yield SummaryTable(rows, "Combined changes")
+    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(weak_changes[_MAX_DIRECTIONS:])) > 0:
         yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
@@ -345,24 +345,6 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield next_steps_table(result, steps)
 
 
-def _relative_std_text(std: float | None) -> str:
-    """Return a relative standard deviation in percent. One above a limit does not read as the limit."""
-    if std is None or std >= 10:
-        return "∞" if std is None else "above 1000 %"
-    return f"{100 * std:.3g} %" if 0.1 < std < 0.11 else f"{percent_number_text(std)} %"
-
-
-def _undetermined_combinations(texts: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on combinations of parameters that cannot be found. Those of one cause share a sentence."""
-    alike = dict[str, list[str]]()
-    for text in texts:
-        change, _, cause = text.removeprefix("these recordings cannot distinguish ").partition(" from ")
-        alike.setdefault(cause or change, []).append(change)
-    for cause, changes in alike.items():
-        named = f"These recordings cannot distinguish {', or '.join(changes)} from {cause}."
-        yield named if changes != [cause] else f"{cause}."
-
-
 def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str]]:
     """Yield table rows with the changes of several parameters together that the recordings determine only weakly."""
     for entry in directions:
@@ -370,8 +352,7 @@ def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[
         order = sorted(changes, key=lambda name: -abs(changes[name]))
         named = [name for name in order if abs(changes[name]) > _MIN_NAMED_SHARE * abs(changes[order[0]])]
         if entry["verdict"] == "weak" and len(named) > 1:
-            signs = {name: "-" if changes[name] < 0 else "+" for name in named[:_MAX_CHANGES]}
-            yield (", ".join(f"{n} {sign}{percent_number_text(abs(changes[n]))} %" for n, sign in signs.items()),)
+            yield (", ".join(f"{name} {100 * changes[name]:+.3g} %" for name in named[:_MAX_CHANGES]),)
 
 
 @register_summary("yid-plan/1")
@@ -484,9 +465,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Recordings", is_key_table=True)
     share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
     yield f"The noise is {share:g} of the std in a fit (diagnosis.noise_fraction_of_stated_std)." if share < 1 else ""
-    for text, names in apart.items():
-        said = f"At the start of {abbreviated_names_text(names)}, hand and object are apart at grasp {text}."
-        yield said if text else ""
+    told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
+    yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
         rows = [(head, "lowest natural frequencies [Hz]", "remark")]
@@ -527,7 +507,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    text = "Every free parameter changes the readings by more than noise. `yid-ocp identifiability` tells whether they "
+    text = "A change of 10 % of any free parameter shows in the readings. `yid-ocp identifiability` tests whether they "
     text += "can be told apart."
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
@@ -547,8 +527,6 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     text += f"{_MIN_VISIBLE_CHANGE} or more{within}). Equations: those of a time step that contain the parameter (del: "
     yield f"{text}motion of a coordinate, p1: its momentum after the step). Observed: those that change a reading."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
-    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"{left} more free parameters are in result.json." if left > 0 and not result["asked"] else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
         yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
@@ -569,18 +547,16 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Yield the equations with each named (else each free) parameter, and how its change changes the readings."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
-    shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    yield "parameter", "change", "all readings [std]", "one reading [std]", "best sensor", *_EQUATION_HEADS
+    shown = [name for name in known if result["parameters"][name]["free"]]
+    yield "parameter", "change", "all readings [std]", "one reading [std]", "best sensor", "equations", "observed"
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
         observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else observed
-        moves = [None if own[key] is None else own[key] * change for key in ("along", "moved")]
-        small = f"< {_NEGLIGIBLE_STDS:g}"
+        moves, small = [own[key] and own[key] * change for key in ("along", "moved")], f"< {_NEGLIGIBLE_STDS:g}"
         sizes = ["" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves]
-        cells = *sizes, own["best"], _row_names_text(rows), sight, ", ".join(own["read"])
-        yield name, f"{change:.3g} {own['unit']}", *cells
+        yield name, f"{change:.3g} {own['unit']}", *sizes, own["best"], _row_names_text(rows), sight
 
 
 def _shown_change(parameter: Mapping[str, Any]) -> float:
@@ -589,10 +565,9 @@ def _shown_change(parameter: Mapping[str, Any]) -> float:
 
 
 def _row_names_text(names: Sequence[str]) -> str:
-    """Return names of rows in one line, or their counts by kind if that line would be too long."""
-    text, kinds = abbreviated_names_text(names), [name.partition("[")[0] for name in names]
-    counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
-    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
+    """Return names of equations in one line, or only their number if that line would be too long."""
+    text = abbreviated_names_text(names)
+    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
 
 
 @register_summary("yid-simulate/1")
@@ -600,13 +575,13 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
-    else:
-        said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
-        yield SummaryStatement(said, "verdict")
-        rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-        yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
-        option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
-        yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
+        return
+    said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
+    yield SummaryStatement(said, "verdict")
+    rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
+    yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
+    option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
+    yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
 
 
 @register_summary("yid-track/1")

@@ -34,11 +34,7 @@ from yid_ocp.report.diagnosis_summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
-from yid_ocp.virtual.mujoco_simulation import (
-    REPLAY_FEEDBACK_BANDWIDTH,
-    ReplayErrorAgainstRecording,
-    replay_mismatch_by_channel,
-)
+from yid_ocp.virtual.mujoco_simulation import ReplayErrorAgainstRecording, replay_mismatch_by_channel
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
@@ -288,7 +284,6 @@ def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> d
         "status": "done",
         "which": which,
         "recordings": [recording.name for recording in recordings],
-        "bandwidth": REPLAY_FEEDBACK_BANDWIDTH,
         "channels": channels,
         "fall": _fall([(before[name], error) for name, error in after.items()]),
     }

@@ -104,6 +104,7 @@ def run_identifiability(
             safe = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
             problem, solution = safe.problem, safe.solution
         tasks = None
+        knowledge: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
         if workers is not None:
             told = {
                 "config": folder.path / "config.yaml",
@@ -111,8 +112,7 @@ def run_identifiability(
                 "inputs": sorted({p.absolute() for n, p in input_files_by_name(run).items() if n != "configuration"}),
                 "x": None if solution is None else fisher.unknown_vector_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
-                "start": asked.start_knowledge,
-                "grasp_std": asked.grasp_offset_std,
+                **knowledge,
             }
             tasks = _IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
         unknown = information = ranking = None
@@ -120,7 +120,7 @@ def run_identifiability(
             progress.begin_stage("computing the Fisher information")
             judged = partial(fisher.identifiability, problem, solution, limits=limits)
             unknown = judged(start="unknown", grasp_std=fisher.GRASP_OFFSET_PRIOR_STD)
-            judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)
+            judged = partial(judged, **knowledge)
             information = judged()
             wanted, names = asked.interval_parameters, information.parameter_names
             if isinstance(wanted, str):
@@ -132,10 +132,9 @@ def run_identifiability(
                 information = judged(intervals=wanted, progress=progress)
             if asked.rank_changes:
                 other = system_with_second_arm_holding_object(run, system)
-                known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
-                known["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
-                known["evaluate_changes"] = None if tasks is None else tasks.evaluate_experiment_change_sets
-                ranking = what_if.what_if(problem, solution, progress=progress, **known)
+                knowledge["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
+                knowledge["evaluate_changes"] = None if tasks is None else tasks.evaluate_experiment_change_sets
+                ranking = what_if.what_if(problem, solution, progress=progress, **knowledge)
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log_event("end", status=result["status"], message=result["message"])
         written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
@@ -160,7 +159,6 @@ def _identifiability_result(
         "message": "judged at the initial values" if solution is None else solution.message,
         "at": asked.evaluation_point,
         "start": asked.start_knowledge,
-        "has_grasps": bool(problem.system.grasps),
         "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
         "issues": issues_to_plain_data(problem.options.data_issues),

@@ -45,12 +45,11 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     files, asked = arguments.files, reader_options_from_arguments(arguments)
     if arguments.preview:
         return _preview(arguments, asked)
-    if arguments.out is None:
-        allowed, hint = "--out NAME.h5, or --preview", f"add --out {Path(files[0]).stem}.h5"
-        raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
-    if not has_native_recording_suffix(arguments.out):
-        what, hint = f"'{arguments.out}' does not end in .h5", f"write --out {Path(arguments.out).with_suffix('.h5')}"
-        raise ConfigError(what, where="--out", allowed="NAME.h5", hint=hint)
+    if arguments.out is None or not has_native_recording_suffix(arguments.out):
+        name, where = arguments.out or Path(files[0]).name, "--out"
+        what = "the option --out is missing" if arguments.out is None else f"'{name}' does not end in .h5"
+        hint = f"write --out {Path(name).with_suffix('.h5')}"
+        raise ConfigError(what, where=where, allowed="NAME.h5, or --preview", hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
@@ -134,15 +133,15 @@ def recording_issue_lines(recording: Recording) -> list[str]:
     return ["", *said] if said else []
 
 
-def _read(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> Recording:
+def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) -> Recording:
     """Return one recording from one or more files. An option applies to every file whose format has it."""
     if len(files) == 1:
-        _option_names_by_file(files, options)
-        return read_third_party_recording(files[0], options, progress)
-    options = dict(options)
+        _option_names_by_file(files, given)
+        return read_third_party_recording(files[0], given, progress)
+    options: dict[str, Any] = {**given}
     offsets = options.pop("file_clock_offsets", None)
     known = _option_names_by_file(files, options)
-    late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
+    late = {k: v for k, v in options.items() if k in ("joints", "point_names", "torque_constants", "gear_ratios")}
     units = dict(options.get("units") or {})
     if units.get("effort") in base.MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}

@@ -191,9 +191,7 @@ def _dependence(
 
 
 def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:
-    marked, nonzero = pattern.marked_mask, pattern.nonzero_mask
-    count = None if marked is None else int(np.count_nonzero(nonzero & marked))
-    return {"shape": list(nonzero.shape), "nonzeros": pattern.n_nonzeros, "at_point": count, "title": pattern.title}
+    return {"shape": list(pattern.nonzero_mask.shape), "nonzeros": pattern.n_nonzeros, "title": pattern.title}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:
