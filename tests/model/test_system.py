@@ -189,7 +189,7 @@ def test_changed_sets_keep_order_and_symbols(three):
         (lambda p: p.lower_and_upper_bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
         (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["two parameters are called", "T1.bend"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
-        (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),
+        (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "at least 2"]),
     ],
 )
 def test_errors_name_what_is_wrong_and_what_is_allowed(refused_with, three, action, words):

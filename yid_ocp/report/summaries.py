@@ -305,7 +305,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield said if own != [cause] else f"{cause}."
     weak_changes = [*_weak_combined_changes(result["directions"])]
     said = "Some parameters can be exchanged for each other: the recordings hardly show the changes of a line together "
-    said += "(one standard deviation, in % of the last value of each). Measure the first parameter in another way and fix it."
+    said += "(one standard deviation, in % of its last value). Measure the first parameter in another way and fix it."
     yield said if weak_changes else ""
     rows = [("change that the recordings hardly show",), *weak_changes[:_MAX_DIRECTIONS]]
     yield SummaryTable(rows, "Combined changes")
