@@ -72,7 +72,7 @@ def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path):
         hashes.append(file_sha256(folder))
     assert hashes[0] == hashes[1] != hashes[2]
     with pytest.raises(DataError, match=r"(?s)no such file.*did you mean 'in'"):
-        file_sha256(tmp_path / "inn")
+        file_sha256(tmp_path / "inn.json")
 
 
 def test_the_hash_of_data_is_that_of_its_content():

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
@@ -122,7 +123,8 @@ def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str
     The hint asks whether the most similar known name was meant. If no name is similar, it is `otherwise`.
     """
     names = [str(entry) for entry in known]
-    otherwise = otherwise or (f"use an allowed name, such as '{names[0]}'" if names else f"leave '{name}' out")
+    example = next(iter(_close(name, names, 1, 0.0)), "")
+    otherwise = otherwise or (f"use an allowed name, such as '{example}'" if names else f"leave '{name}' out")
     return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}
 
 
@@ -145,6 +147,13 @@ def nearest_name_question(name: str, names: Iterable[str]) -> str:
     """Return the question "did you mean NAME?" for the most similar known name. Empty if no name is similar."""
     close = _close(name, [*names], 1, 0.6)
     return f"did you mean '{close[0]}'?" if close else ""
+
+
+def nearest_file_question(path: Path, pattern: str = "*") -> str:
+    """Return the question "did you mean NAME?" for the file beside `path` of the most similar name without ending."""
+    names = {entry.stem: entry.name for entry in path.parent.glob(pattern) if entry != path}
+    close = _close(path.stem, [*names], 1, 0.6)
+    return f"did you mean '{names[close[0]]}'?" if close else ""
 
 
 def _listed(name: str, names: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from yid_ocp.errors import DataError, OutputError, nearest_name_question
+from yid_ocp.errors import DataError, OutputError, nearest_file_question
 
 _DataclassType = TypeVar("_DataclassType")
 
@@ -41,9 +41,8 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"
         if isinstance(error, ValueError):
             what, allowed = "the path contains a null character", "a path without null characters"
-        near = os.listdir(path.parent) if absent and os.access(path.parent, os.R_OK) else ()
         hint = f"`ls {path.parent}` lists names" if os.path.isdir(path.parent) else f"there is no folder {path.parent}"
-        hint = nearest_name_question(path.name, near) or f"correct the path: {hint}"
+        hint = (absent and nearest_file_question(path)) or f"correct the path: {hint}"
         raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
     if not readable:
         hint = f"allow reading by `chmod u+r {path}`, or copy the file to a folder of your own"

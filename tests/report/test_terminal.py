@@ -132,8 +132,12 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert first in " ".join(lines[:7])
     assert "The model does not explain the recordings, so agreement of methods does not confirm the values." in lines
     assert line_of(lines, "a  ").split()[-2:] == ["in", "doubt"]
-    doubtful = information(parameters={"a": judged("not_trusted")}, fit=BAD)
-    assert " ".join(told("yid-identifiability/1", doubtful)[:3]) == first
+    change = {"verdict": "weak", "std_relative": 2.0, "components": {"b": 0.6, "a": -0.8, "c": 0.01}, "words": ""}
+    doubtful = information(parameters={"a": judged("not_trusted")}, fit=BAD, directions=[change])
+    lines = told("yid-identifiability/1", doubtful)
+    assert (" ".join(lines[:3]), "a -160 %, b +120 %" in lines) == (first, True)
+    assert "in doubt: the model does not explain the recordings, so the value may be wrong even if" in " ".join(lines)
+    assert line_of(lines, "find the cause of the model's error").endswith(" yid-ocp diagnose CONFIG")
 
 
 @pytest.mark.parametrize(

@@ -184,6 +184,13 @@ def test_effects_that_were_found_come_back_free(found, tmp_path, exported) -> No
     assert build_system(run).parameters["T1.bend"].value == run.parameters["T1.bend"].initial != 10.0
 
 
+def test_recorded_points_of_a_robot_without_an_object_are_replayed(cli, repository, tmp_path, exported) -> None:
+    assert cli("solve", repository / "configs" / "springs_series_joint.yaml", "--out", tmp_path / "run").code == 0
+    channels = exported(tmp_path / "run", tmp_path / "s.xml")["gate"]["channels"]
+    assert [*channels] == ["points_camera.joint", "points_camera.end"]
+    assert all(own["after"] < 1.2 * own["noise"] < 0.2 * own["before"] for own in channels.values())
+
+
 def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> None:
     recording = pendulum_data.folder / "estimate.h5"
     broken = shutil.copytree(found, tmp_path / "broken")

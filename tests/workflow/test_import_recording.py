@@ -61,16 +61,14 @@ def test_what_the_preview_proposes_imports_the_file(odd, printed):
     assert {source["name"] for source in told["sources"]} >= {"t"}
     *_, said = printed("import", "plain.csv", "--preview").strip().splitlines()
     assert not (odd / "plain.h5").exists()
-    program, *words = shlex.split(said)
-    assert program == "yid-ocp"
-    printed(*words)
+    assert said.split()[0] == "yid-ocp"
+    printed(*shlex.split(said)[1:])
     recording = read_recording(odd / "plain.h5")
     assert recording.joints.position[0, 0] == pytest.approx(math.pi / 2)
     assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
     # a recording of our own is shown, too
     told = printed("import", "plain.h5", "--preview")
-    assert "note: the file is already a recording" in told
-    assert "to import it" not in told
+    assert ("note: the file is already a recording" in told, "to import it" in told) == (True, False)
 
 
 def test_left_out_lines_are_told(odd, printed):
@@ -158,7 +156,9 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
 )
 def test_doubts_are_said_at_import(text, said, odd, printed):
     (odd / "run.csv").write_text(text)
-    assert said in printed("import", "run.csv", "--out", "run.h5")
+    printed("import", "run.csv", "--out", "run.h5")
+    told = printed("import", "run.csv", "--out", "run.h5")
+    assert all(part in told for part in (said, "existed and was replaced\nafter the advice above is followed"))
 
 
 def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
@@ -183,9 +183,8 @@ def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
 def test_no_command_is_suggested_that_would_fail(odd, printed):
     (odd / "run.csv").write_text("t,bend\n0,1\n1,2\n")
     told = printed("import", "run.csv", "--preview")
-    assert "the import needs more information" in told
-    assert "--columns 'bend=position:JOINT'" in told
-    assert "yid-ocp import" not in told
+    parts = "the import needs more information", "--columns 'bend=position:JOINT'", "yid-ocp import"
+    assert [part in told for part in parts] == [True, True, False]
 
 
 def test_every_flag_is_a_key_of_the_section():

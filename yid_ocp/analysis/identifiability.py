@@ -434,11 +434,10 @@ def _combination_words(parts: Sequence[_Component]) -> str:
     """Return a sentence on the combined change of parameters along an unidentifiable direction."""
     if len(parts) == 1:
         return f"{parts[0].name} is observed by no sensor"
-    largest, shown = max(abs(part.coefficient) for part in parts), parts
-    if len(parts) > _MAX_LISTED_NAMES:
-        shown = sorted(parts, key=lambda part: -abs(part.coefficient))[:_MAX_LISTED_NAMES]
-    trade = " with ".join(f"{part.name} {10 * part.coefficient / largest:+.2g} %" for part in shown)
-    rest = " and matching changes of the others" if len(shown) < len(parts) else ""
+    order = sorted(parts, key=lambda part: -abs(part.coefficient))
+    sizes = ((part.name, 10 * part.coefficient / abs(order[0].coefficient)) for part in order[:_MAX_LISTED_NAMES])
+    trade = " with ".join(f"{name} {size:+.2g} %" for name, size in sizes)
+    rest = " and matching changes of the others" if len(parts) > _MAX_LISTED_NAMES else ""
     listed = _joined([part.name for part in parts])
     return f"{listed} are determined only together: {trade}{rest} changes no measurement"
 

@@ -218,7 +218,7 @@ class _Outcomes:
         return [self.known[key] for key in keys]
 
     def _judged(self, sets: Sequence[Sequence[ExperimentChange]], _: float) -> list[ChangedExperimentResult]:
-        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'changed experiment')}")
+        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'experiment')}")
         found = []
         for done, changes in enumerate(sets, 1):
             found.append(own := self._outcome(changes))

@@ -24,7 +24,7 @@ from ruamel.yaml.scanner import Scanner
 from yid_ocp import options
 from yid_ocp.config import schema
 from yid_ocp.config.settings import RunSettings, innermost_location
-from yid_ocp.errors import ConfigError, DataError, nearest_name_question
+from yid_ocp.errors import ConfigError, DataError, nearest_file_question, nearest_name_question
 from yid_ocp.files import read_input_text
 
 _KeyPath = tuple[str | int, ...]
@@ -73,8 +73,7 @@ def _read(path: Path) -> str:
         what, hint = error.what, error.hint
         if isinstance(error.__cause__, FileNotFoundError):
             what = "there is no such configuration file"
-            if path.parent.is_dir():
-                hint = nearest_name_question(path.name, (entry.name for entry in path.parent.glob("*.yaml"))) or hint
+            hint = nearest_file_question(path, "*.yaml") or hint
         raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
 
 

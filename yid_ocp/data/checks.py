@@ -28,7 +28,7 @@ from yid_ocp.data.channel_checks import (
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import count_with_noun
 
-_CLOCK_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
+_CLOCK_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # [s]
 _MIN_UNIX_TIME = 1e8  # larger time stamps are seconds since 1970, smaller since power-on [s]
 _MAX_SAMPLE_GAP = 0.1  # longest interpolated gap; arm motion has a bandwidth of 5 Hz [s]
 _MAX_MISSING_PERIODS = 5  # sample periods that may always be missing

@@ -36,9 +36,10 @@ class Parameter:
         if not self.lower <= self.value <= self.upper:
             is_low = self.value < self.lower
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
+            allowed = f"{'at least' if is_low else 'at most'} {bound:g} {self.unit}"
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
             where, hint = f"parameters.{self.name}", f"change parameters.{self.name}.initial, or its `bounds`"
-            raise ConfigError(what, where=where, allowed=f"{self.lower:g} to {self.upper:g} {self.unit}", hint=hint)
+            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 
 class Parameters(ReprMixin):

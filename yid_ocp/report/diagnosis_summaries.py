@@ -532,30 +532,37 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
     yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
+    gate = manifest["gate"] or {}
+    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate))
     if unknown := manifest["unknown"]:
-        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the"
-        yield SummaryStatement(f"{text} search ended. Do not rely on them.", "verdict")
+        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has them with the values"
+        yield SummaryStatement(f"{text} where the search ended. Do not rely on them.", "verdict")
     found = {name: kinds[entry["status"]] + ", value unknown" * (name in unknown) for name, entry in entries}
     yield SummaryTable([*rows, *((name, found[name], entry["how"]) for name, entry in entries)])
-    if (gate := manifest["gate"]) is None:
-        return
-    if gate["status"] != "done":
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
-        return
-    rows = [("replayed channel", "error (rms) without estimates", "as exported", "noise", "unit")]
-    for name, entry in gate["channels"].items():
+    rows = [("replayed channel", "error (rms) with initial values", "as exported", "noise", "unit")]
+    for name, entry in gate.get("channels", {}).items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows) if gate["channels"] else "The file is untested: MuJoCo replays no recorded channel."
+    yield SummaryTable(rows)
+
+
+def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
+    if "reason" in gate:
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
+    if "channels" not in gate:
+        return
     held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
     ratios = {name: own["after"] / own["noise"] for name, own in gate["channels"].items() if own["noise"]}
+    if not gate["channels"]:
+        yield "The file is untested, because a replay in MuJoCo has nothing to compare with the recordings."
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
         is_good = ratios[worst] < _MAX_REPRODUCED_ERROR
         text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}. The error of"
-        yield f"{text} {worst} is the largest, {ratios[worst]:.4g} times its noise."
+        yield f"{text} {worst} is the largest, {ratios[worst]:.4g} times its noise (limit: {_MAX_REPRODUCED_ERROR})."
         if not is_good and "joints.position" in gate["channels"]:  # arms move by their torques
             text = "Errors of recorded torques can cause this too. To exclude them, solve and export again with"
             yield f"{text} --set model.arms.mode=prescribed, which moves the arms as measured."
     if (fall := gate["fall"]) is not None:
-        change = f"{100 * abs(fall):.3g} % {'more' if fall < 0 else 'less'}"
-        yield f"In MuJoCo, the error beyond noise on {held} is {change} than without estimates."
+        change = f"{100 * abs(fall):.3g} % {'larger' if fall < 0 else 'smaller'}"
+        yield f"In MuJoCo, the error beyond noise on {held} is {change} than with the initial values."

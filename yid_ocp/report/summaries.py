@@ -9,10 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
-    MAX_WEAK_RELATIVE_STD,
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
@@ -47,11 +46,12 @@ _BASELINE_DESCRIPTIONS = {
     "moves_with_clamps": "every point moves like the mean of the clamps that hold the cable",
     "linear_carry": "the motion of a point is interpolated linearly between the clamps",
 }
-_MAX_DIRECTIONS = 8
+_MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
+_MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
-_MAX_INSPECTED_PARAMETERS = 12  # free parameters that `inspect` lists; result.json has all
 _MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
+_MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
@@ -264,12 +264,12 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± with initial state and grasps estimated too", "± with all else known")
+    unsure = ("± [of the value]", "± with initial state (and any grasps) estimated too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
         stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = ("∞" if s is None else f"{percent_number_text(s)} %" if s < 10 else "above 1000 %" for s in stds)
+        spread = ("∞" if s is None else f"{100 * s:.3g} %" if s < 9.995 else "above 1000 %" for s in stds)
         interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -288,16 +288,29 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
+    yield "The ± leave out the error of simulation (time step, number of links), which `solve` adds." * (not is_initial)
+    is_poor = result["fit"] is not None and not result["fit"]["explains"]
+    doubtful = "the model does not explain the recordings" if is_poor else "a recording has a severe issue"
     meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
+    meanings["in doubt"] = f"{doubtful}, so the value may be wrong even if its ± is small"
     yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
-    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
     hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    yield from _combination_blocks(hidden[:_MAX_DIRECTIONS])
-    if len(hidden) > _MAX_DIRECTIONS:
-        yield f"{len(hidden) - _MAX_DIRECTIONS} more such combinations of parameters are in result.json (`directions`)."
+    shown = (words.removeprefix("these recordings cannot distinguish ") for words in hidden[:_MAX_DIRECTIONS])
+    parts = (words.partition(" from ") for words in shown)
+    for cause, own in grouped((cause or change, change) for change, _, cause in parts).items():
+        said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
+        yield said if own != [cause] else f"{cause}."
+    weak_changes = [*_weak_combined_changes(result["directions"])]
+    said = "Some parameters can be exchanged for each other: the recordings hardly show the changes of a line together "
+    said += "(one standard deviation, in % of its last value). Measure the first parameter in another way and fix it."
+    yield said if weak_changes else ""
+    rows = [("change that the recordings hardly show",), *weak_changes[:_MAX_DIRECTIONS]]
+    yield SummaryTable(rows, "Combined changes")
+    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(weak_changes[_MAX_DIRECTIONS:])) > 0:
+        yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     if (asked := result["what_if"]) is not None:
         said = "No set of up to three changes makes it possible to find all parameters."
@@ -317,6 +330,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
     steps = {"fit, for estimates with intervals": "identifiability"} if is_initial else {}
+    steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
     more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
@@ -331,21 +345,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield next_steps_table(result, steps)
 
 
-def _combination_blocks(texts: Sequence[str]) -> SummaryBlockOrTextIterator:
-    """Yield sentences on combinations of parameters that cannot be found, by cause, and a table of the weak ones."""
-    alike = dict[str, list[str]]()
-    rows: TableRows = [("combined change of parameters", "± of this combined change")]
-    for text in texts:
-        what, _, spread = text.removesuffix(")").partition(" is determined only weakly (± ")
-        change, _, cause = what.removeprefix("these recordings cannot distinguish ").partition(" from ")
-        if spread:
-            rows.append((what.removeprefix("a change of "), spread))
-        else:
-            alike.setdefault(cause or change, []).append(change)
-    for cause, changes in alike.items():
-        named = f"These recordings cannot distinguish {', or '.join(changes)} from {cause}."
-        yield named if changes != [cause] else f"{cause}."
-    yield SummaryTable(rows, "Weakly determined combinations")
+def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str]]:
+    """Yield table rows with the changes of several parameters together that the recordings determine only weakly."""
+    for entry in directions:
+        changes = {name: entry["std_relative"] * part for name, part in entry["components"].items()}
+        order = sorted(changes, key=lambda name: -abs(changes[name]))
+        named = [name for name in order if abs(changes[name]) > _MIN_NAMED_SHARE * abs(changes[order[0]])]
+        if entry["verdict"] == "weak" and len(named) > 1:
+            yield (", ".join(f"{name} {100 * changes[name]:+.3g} %" for name in named[:_MAX_CHANGES]),)
 
 
 @register_summary("yid-plan/1")
@@ -371,7 +378,8 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
-    steps = ({} if result["from"]["run"] else steps) | (record if result["goal"] == "information" else {})
+    steps = {} if result["from"]["run"] or is_hopeless else steps
+    steps |= record if result["goal"] == "information" else {}
     yield next_steps_table(result, longer if not is_usable and said != done else steps)
 
 
@@ -457,9 +465,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Recordings", is_key_table=True)
     share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
     yield f"The noise is {share:g} of the std in a fit (diagnosis.noise_fraction_of_stated_std)." if share < 1 else ""
-    for text, names in apart.items():
-        said = f"At the start of {abbreviated_names_text(names)}, hand and object are apart at grasp {text}."
-        yield said if text else ""
+    told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
+    yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
         rows = [(head, "lowest natural frequencies [Hz]", "remark")]
@@ -498,27 +505,28 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
+    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
+    hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
+    text = "A change of 10 % of any free parameter shows in the readings. `yid-ocp identifiability` tests whether they "
+    text += "can be told apart."
+    if hidden:
+        text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
+        text += "noise hides a change of 10 %. `yid-ocp identifiability` tests this after a fit."
+    yield SummaryStatement(text if changes else "", "conclusion")
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
-    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
-    values = {n: abs(result["parameters"][n]["value"]) for n in changes}
-    lost = [n for n, along in changes.items() if values[n] and along * values[n] * MAX_WEAK_RELATIVE_STD < 1]
-    text = f"At the initial values and starts of motion, the recordings tell nothing of {abbreviated_names_text(lost)} "
-    text += f"(± above {MAX_WEAK_RELATIVE_STD:g} times the value). `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if lost else "Every free parameter changes a reading." * bool(changes), "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
     said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    begun = f" Of one reading, it is the largest within {seconds:.2g} s of equilibrium." if seconds else ""
-    text = "The table has the equations of a time step that contain a parameter (del: motion of a coordinate, p1: its "
-    text += "momentum after the step), and those that change a reading (observed). The last columns have the change of "
-    yield f"{text}readings by one unit of the parameter, in standard deviations of noise (std).{begun}"
+    within = f"; of one reading: within {seconds:.2g} s of equilibrium" if seconds else ""
+    text = "The table has how far a change of each parameter (10 %, or one unit if zero) changes the readings, in "
+    text += "standard deviations of their noise (of all readings: root of the sum of squares, and noise does not hide "
+    text += f"{_MIN_VISIBLE_CHANGE} or more{within}). Equations: those of a time step that contain the parameter (del: "
+    yield f"{text}motion of a coordinate, p1: its momentum after the step). Observed: those that change a reading."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
-    left = sum(result["parameters"][name]["free"] for name in result["dependence"]) - _MAX_INSPECTED_PARAMETERS
-    yield f"{left} more free parameters are in result.json." if left > 0 and not result["asked"] else ""
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
         yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
     rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
@@ -527,40 +535,39 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
         rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
     yield SummaryTable(rows, "Parameters")
-    for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
-        parts = [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in result["blocks"][kind]]
-        yield SummaryTable([(head, "size", "first entry", "meaning"), *parts], head.capitalize())
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
     files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
     yield f"The folder has equations.txt (all equations and names), {files}."
-    yield next_steps_table(result, {"show which can be found together": "identifiability"} if changes else {})
+    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield the equations with each named (else each free) parameter, and the change of readings by one unit of it."""
+    """Yield the equations with each named (else each free) parameter, and how its change changes the readings."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
-    shown = [name for name in known if result["parameters"][name]["free"]][:_MAX_INSPECTED_PARAMETERS]
-    head = "parameter", "unit", "equations", "which", "observed equations", "best sensor", "measured by"
-    yield *head, "change of one reading [std]", "change of all readings [std]"
+    shown = [name for name in known if result["parameters"][name]["free"]]
+    yield "parameter", "change", "all readings [std]", "one reading [std]", "best sensor", "equations", "observed"
     for name in dict.fromkeys(result["asked"] or shown):
-        own = known[name]
+        own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
         observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else observed
-        moves, small = (own["moved"], own["along"]), f"< {_NEGLIGIBLE_STDS:g}"
-        changes = ("" if x is None else f"{x:.2g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
-        sensors = own["best"], ", ".join(own["read"])
-        yield name, own["unit"], str(len(rows)), _row_names_text(rows), sight, *sensors, *changes
+        moves, small = [own[key] and own[key] * change for key in ("along", "moved")], f"< {_NEGLIGIBLE_STDS:g}"
+        sizes = ["" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves]
+        yield name, f"{change:.3g} {own['unit']}", *sizes, own["best"], _row_names_text(rows), sight
+
+
+def _shown_change(parameter: Mapping[str, Any]) -> float:
+    """Return the change of a parameter for which `inspect` shows the change of readings: 10 %, or one unit if zero."""
+    return abs(parameter["value"]) / 10 or 1.0
 
 
 def _row_names_text(names: Sequence[str]) -> str:
-    """Return names of rows in one line, or their counts by kind if that line would be too long."""
-    text, kinds = abbreviated_names_text(names), [name.partition("[")[0] for name in names]
-    counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
-    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else counts
+    """Return names of equations in one line, or only their number if that line would be too long."""
+    text = abbreviated_names_text(names)
+    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
 
 
 @register_summary("yid-simulate/1")
@@ -568,13 +575,13 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
-    else:
-        said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
-        yield SummaryStatement(said, "verdict")
-        rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-        yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
-        option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
-        yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
+        return
+    said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
+    yield SummaryStatement(said, "verdict")
+    rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
+    yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
+    option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
+    yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
 
 
 @register_summary("yid-track/1")

@@ -19,7 +19,7 @@ from typing import Any
 from yid_ocp.analysis.run_estimates import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_question
+from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_file_question
 from yid_ocp.files import file_sha256, folder_error, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.html import write_report, write_shared_plotly_script
@@ -71,8 +71,7 @@ def batch_runs_from_configs(
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
         if not path.is_file():
-            near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            hint, what = nearest_name_question(path.name, near) or "correct the path", "there is no such configuration"
+            hint, what = nearest_file_question(path, "*.yaml") or "correct the path", "there is no such configuration"
             raise ConfigError(what, where=str(path), allowed="the path of an existing YAML file", hint=hint)
         if path.resolve() in [other.resolve() for other in paths[:i]]:
             what, allowed = f"the configuration {path.name} is given twice", "every configuration once"

@@ -83,7 +83,8 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             raise run.config_error(what, "model", "arms", key, allowed=allowed, hint=hint)
     if robot is None and not objects:
         what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
-        raise run.config_error(what, "model", allowed=allowed, hint="set model.robot or model.object")
+        hint = "set model.robot or model.object" + ("" if run.key_locations else "; the configuration is empty")
+        raise run.config_error(what, "model", allowed=allowed, hint=hint)
     with add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot, [item for item, *_ in objects])
     with add_setting_location_to_errors(run, "model", "object", "mount", "parent_frame"):
@@ -449,10 +450,8 @@ def marker_position_values_by_recording(
         found[recording.name] = {}
         for name, pose in zip(names, placed, strict=True):
             if name not in group:
-                what = f"the frame {name} takes its position from the recorded point of this name, which recording "
-                what += f"'{recording.name}' lacks"
-                hint = "rename the frame to a recorded point, or set xyz: [x, y, z] in place of "
-                hint += "use_recorded_straight_position"
+                what = f"recording '{recording.name}' lacks the point '{name}', where the frame of this name is placed"
+                hint = "rename the frame to a recorded point, or set its xyz: [x, y, z] instead"
                 allowed = unknown_name_error_arguments(name, group)["allowed"]
                 raise run.config_error(what, "model", "frames", name, allowed=allowed, hint=hint)
             local = pose[:3, :3].T @ (recording.marker_reference_pose[group.index(name)] - pose[:3, 3])

@@ -34,11 +34,7 @@ from yid_ocp.report.diagnosis_summaries import summarize_export
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
-from yid_ocp.virtual.mujoco_simulation import (
-    REPLAY_FEEDBACK_BANDWIDTH,
-    ReplayErrorAgainstRecording,
-    replay_mismatch_by_channel,
-)
+from yid_ocp.virtual.mujoco_simulation import ReplayErrorAgainstRecording, replay_mismatch_by_channel
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
@@ -199,7 +195,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     write_text(out, text)
     try:
         if form == "mjcf":
-            manifest["gate"] = _gate(calibrated, system, text, progress)
+            manifest["gate"] = _gate(calibrated, system, progress)
         manifest = to_json_types(manifest)
         write_strict_json(out.with_name(f"{out.name}.manifest.json"), manifest)
     except BaseException:
@@ -264,7 +260,7 @@ def _expressible(
                 raise ModelError(what, where=error.where, allowed=error.allowed, hint=hint) from error
 
 
-def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Progress) -> dict[str, Any]:
+def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> dict[str, Any]:
     """Return the errors of the exported and the nominal model on held-out recordings, or on fitted ones if none are."""
     which = "held_out" if calibrated.settings.recordings.held_out else "estimate"
     try:
@@ -274,9 +270,10 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         import_mujoco("the replay needs MuJoCo")
         progress.begin_stage("replaying recordings in MuJoCo")
         nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
+        system, nominal = (_with_recorded_points(own, recordings) for own in (system, nominal))
         recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
-        after = _replayed(text, system, recordings, progress, 1)
+        after = _replayed(calibrated.text("mjcf", system), system, recordings, progress, 1)
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": ". Try: ".join(filter(None, (error.what, error.hint)))}
     channels = {}
@@ -287,10 +284,15 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         "status": "done",
         "which": which,
         "recordings": [recording.name for recording in recordings],
-        "bandwidth": REPLAY_FEEDBACK_BANDWIDTH,
         "channels": channels,
         "fall": _fall([(before[name], error) for name, error in after.items()]),
     }
+
+
+def _with_recorded_points(system: System, recordings: Sequence[Recording]) -> System:
+    """The system with recorded points at its frames, unless it has measured points already."""
+    names = {name for recording in recordings for group in recording.points for name in group.names}
+    return replace(system, point_frames=system.point_frames or tuple(sorted(names & {*system.mechanism.frames})))
 
 
 def _with_configured_noise(recording: Recording, system: System, sensors: Mapping[str, SensorOptions]) -> Recording:

@@ -14,7 +14,6 @@ from yid_ocp.display import PartsDoneCounter, Progress
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE, DataError
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY
 from yid_ocp.solvers import Solution, Status, fit_problem
 from yid_ocp.workflow.build import friction_joint_names, friction_parameter_names
@@ -32,6 +31,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
     said = run.model.friction or FrictionLawSettings(law="viscous")
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
+        progress.begin_stage("building the models of the friction laws")
         fits: list[CrossValidatedFrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
         by_law = {
@@ -98,9 +98,7 @@ def _testable_motion_kinds(run: RunSettings, problem: EstimationProblem) -> dict
     if {*rubbing} <= {*problem.system.prescribed} and not any(own.sensor.effort_joints for own in compared):
         what = "the joints follow their measured angles, so friction shows only in torques, which are not used"
         where, hint = run.setting_location("sensors"), f"set sensors.{JOINT_EFFORT_SENSOR_KEY}.use: true"
-        arm, said = problem.episodes[0].recording.joints, run.sensors.get(JOINT_EFFORT_SENSOR_KEY, SensorOptions())
-        if said.bias_std is None and arm is not None and arm.effort_bias_std is None:
-            hint += " and, unless the torques have no constant error, bias_std there to its expected size [N m]"
+        hint += " and, unless the torques have no constant error or it is stated, bias_std there to its size [N m]"
         raise DataError(what, where=where, allowed="recorded torques that the fit compares with the model", hint=hint)
     return kinds
 

@@ -104,6 +104,7 @@ def run_identifiability(
             safe = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
             problem, solution = safe.problem, safe.solution
         tasks = None
+        knowledge: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
         if workers is not None:
             told = {
                 "config": folder.path / "config.yaml",
@@ -111,8 +112,7 @@ def run_identifiability(
                 "inputs": sorted({p.absolute() for n, p in input_files_by_name(run).items() if n != "configuration"}),
                 "x": None if solution is None else fisher.unknown_vector_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
-                "start": asked.start_knowledge,
-                "grasp_std": asked.grasp_offset_std,
+                **knowledge,
             }
             tasks = _IdentifiabilityTasks(workers, folder.resume_folder / "tasks", told, progress)
         unknown = information = ranking = None
@@ -120,7 +120,7 @@ def run_identifiability(
             progress.begin_stage("computing the Fisher information")
             judged = partial(fisher.identifiability, problem, solution, limits=limits)
             unknown = judged(start="unknown", grasp_std=fisher.GRASP_OFFSET_PRIOR_STD)
-            judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)
+            judged = partial(judged, **knowledge)
             information = judged()
             wanted, names = asked.interval_parameters, information.parameter_names
             if isinstance(wanted, str):
@@ -132,10 +132,9 @@ def run_identifiability(
                 information = judged(intervals=wanted, progress=progress)
             if asked.rank_changes:
                 other = system_with_second_arm_holding_object(run, system)
-                known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
-                known["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
-                known["evaluate_changes"] = None if tasks is None else tasks.evaluate_experiment_change_sets
-                ranking = what_if.what_if(problem, solution, progress=progress, **known)
+                knowledge["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
+                knowledge["evaluate_changes"] = None if tasks is None else tasks.evaluate_experiment_change_sets
+                ranking = what_if.what_if(problem, solution, progress=progress, **knowledge)
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log_event("end", status=result["status"], message=result["message"])
         written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
@@ -227,7 +226,7 @@ class _IdentifiabilityTasks:
         named = [[change.name for change in changes] for changes in sets]
         own = {name: [named[i] for i in members] for name, members in groups.items()}
         tasks = {name: {"sets": members, "inflation": inflation} for name, members in own.items()}
-        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'changed experiment')}")
+        self.progress.begin_stage(f"predicting the ± of {count_with_noun(len(sets), 'experiment')}")
         done = self._done(_change_set_outcomes, tasks)
         order = [i for members in groups.values() for i in members]
         found = [dataclass_from_plain_data(ChangedExperimentResult, entry) for told in done for entry in told]

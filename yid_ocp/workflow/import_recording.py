@@ -45,30 +45,24 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     files, asked = arguments.files, reader_options_from_arguments(arguments)
     if arguments.preview:
         return _preview(arguments, asked)
-    if arguments.out is None:
-        allowed, hint = "--out NAME.h5, or --preview", f"add --out {Path(files[0]).stem}.h5"
-        raise ConfigError("the option --out is missing", where="--out", allowed=allowed, hint=hint)
-    if not has_native_recording_suffix(arguments.out):
-        what, hint = f"'{arguments.out}' does not end in .h5", f"write --out {Path(arguments.out).with_suffix('.h5')}"
-        raise ConfigError(what, where="--out", allowed="NAME.h5", hint=hint)
+    if arguments.out is None or not has_native_recording_suffix(arguments.out):
+        name, where = arguments.out or Path(files[0]).name, "--out"
+        what = "the option --out is missing" if arguments.out is None else f"'{name}' does not end in .h5"
+        hint = f"write --out {Path(name).with_suffix('.h5')}"
+        raise ConfigError(what, where=where, allowed="NAME.h5, or --preview", hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
     with stderr_progress_display(arguments) as progress:
         options = {name: value for name, value in said.items() if value is not None} | asked
-        offsets = options.pop("file_clock_offsets", None)
-        if len(files) > 1:
-            recording = replace(_merged(files, options, offsets, progress), name=Path(arguments.out).stem)
-        elif offsets:
-            what, hint = "--clock-offset aligns several files, but there is only one", "leave --clock-offset out"
-            raise ConfigError(what, where="--clock-offset", allowed="with two files or more", hint=hint)
-        else:
-            _option_names_by_file(files, options)
-            recording = read_third_party_recording(files[0], options, progress)
+        recording = _read(files, options, progress)
+        recording = replace(recording, name=Path(arguments.out).stem) if len(files) > 1 else recording
+        replaced = [f"note: {arguments.out} existed and was replaced"] if Path(arguments.out).exists() else []
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
-    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
-    lines = [*recording_summary_lines(recording), *issues, "", then]
+    first = "after the advice above is followed" if issues else "next"
+    then = f"{first}: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
+    lines = [*recording_summary_lines(recording), *issues, "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
 
@@ -117,12 +111,7 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
     """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing."""
     try:
-        if len(files) > 1:
-            own = {name: value for name, value in options.items() if name != "file_clock_offsets"}
-            recording = _merged(files, own, options.get("file_clock_offsets"), progress)
-        else:
-            _option_names_by_file(files, options)
-            recording = read_any(files[0], progress=progress, **options)
+        recording = _read(files, options, progress)
     except DataError as error:
         unknown = next((key for key, own in (options.get("column_meanings") or {}).items() if own == "skip"), "")
         has_hint = not unknown or "--columns" in error.hint
@@ -144,12 +133,15 @@ def recording_issue_lines(recording: Recording) -> list[str]:
     return ["", *said] if said else []
 
 
-def _merged(
-    files: Sequence[str], options: Mapping[str, Any], offsets: Mapping[str, float] | None, progress: Progress
-) -> Recording:
-    """Return one recording from several files. An option applies to every file whose format has it."""
+def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) -> Recording:
+    """Return one recording from one or more files. An option applies to every file whose format has it."""
+    if len(files) == 1:
+        _option_names_by_file(files, given)
+        return read_third_party_recording(files[0], given, progress)
+    options: dict[str, Any] = {**given}
+    offsets = options.pop("file_clock_offsets", None)
     known = _option_names_by_file(files, options)
-    late = {key: options[key] for key in ("joints", "point_names", "torque_constants", "gear_ratios") if key in options}
+    late = {k: v for k, v in options.items() if k in ("joints", "point_names", "torque_constants", "gear_ratios")}
     units = dict(options.get("units") or {})
     if units.get("effort") in base.MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
@@ -180,7 +172,7 @@ def _option_names_by_file(files: Sequence[str], options: Mapping[str, Any]) -> M
     known = {file: () if has_native_recording_suffix(file) else reader_option_names_for_file(file) for file in files}
     for name in options:
         if not any(name in own for own in known.values()):
-            what = f"{_flag(name)} does not apply to files of {'this format' if len(files) == 1 else 'these formats'}"
+            what = f"{_flag(name)} does not apply to {'this file' if len(files) == 1 else 'files of these formats'}"
             allowed = ", ".join(sorted(map(_flag, _KINDS.keys() & set().union(*known.values())))) or "no options"
             raise DataError(what, where=_flag(name), allowed=allowed, hint=f"leave {_flag(name)} out")
     return known

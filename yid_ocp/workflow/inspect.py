@@ -88,10 +88,6 @@ def _run_inspect(
                 for entry in parameters
             },
             "equations": step_diagnostics.step_complexity_summary(step),
-            "blocks": {
-                kind: [attributes_to_dict(block, "name meaning names=full_names") for block in own if block.labels]
-                for kind, own in (("rows", symbols.row_blocks), ("columns", symbols.column_blocks))
-            },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
@@ -195,9 +191,7 @@ def _dependence(
 
 
 def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:
-    marked, nonzero = pattern.marked_mask, pattern.nonzero_mask
-    count = None if marked is None else int(np.count_nonzero(nonzero & marked))
-    return {"shape": list(nonzero.shape), "nonzeros": pattern.n_nonzeros, "at_point": count, "title": pattern.title}
+    return {"shape": list(pattern.nonzero_mask.shape), "nonzeros": pattern.n_nonzeros, "title": pattern.title}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:

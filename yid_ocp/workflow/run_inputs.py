@@ -17,7 +17,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.effects import EFFECTS
-from yid_ocp.errors import ConfigError, YidError, nearest_name_question, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, YidError, nearest_file_question, unknown_name_error_arguments
 from yid_ocp.files import file_sha256, is_file, json_sha256
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.registry import Registry
@@ -171,9 +171,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
 def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     if is_file(file):
         return file
-    near = file.parent.glob(f"*{file.suffix}") if file.parent.is_dir() else ()
-    names = [entry.name for entry in near if entry.is_file()]
-    hint = nearest_name_question(file.name, names) or "correct the path (relative to the configuration file)"
+    hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 

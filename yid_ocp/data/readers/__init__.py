@@ -17,7 +17,7 @@ from yid_ocp.data.readers.base import READERS as READERS
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
+from yid_ocp.errors import DataError, nearest_file_question, unknown_name_error_arguments
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -72,8 +72,7 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 
 def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
-        near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        hint = nearest_name_question(path.name, near) or "correct the path: its folder has no file of a similar name"
+        hint = nearest_file_question(path) or "correct the path: its folder has no file of a similar name"
         allowed = "the path of a file or folder that you may read"
         raise DataError("there is no such file", where=str(path), allowed=allowed, hint=hint)
     key = path.suffix.lower()

@@ -149,7 +149,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         names = {name: name for name in group.names}
         if options.joints is not None:
             names = parse_old_to_new_joint_names(options.joints, where)
-            require_known_names(names, group.names, "joint", where, DataError)
+            require_known_names(names, group.names, "joint", f"--joints, {where}", DataError)
         at, recorded = [group.names.index(name) for name in names], group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
         if "effort" in channels:
@@ -192,7 +192,7 @@ def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
 
 def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, where: str) -> Array:
     """Factors from recorded efforts to joint torques, [N m] per recorded unit, shape (nj,)."""
-    constants, gear_ratios = options.torque_constants or {}, options.gear_ratios or {}
+    constants, gear_ratios, factors = options.torque_constants or {}, options.gear_ratios or {}, np.ones(len(names))
     for word, given in (("torque constant", constants), ("gear ratio", gear_ratios)):
         for pattern, value in given.items():
             if not fnmatch.filter(names, pattern):
@@ -206,8 +206,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
             what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"
             allowed = "torque constants and gear ratios with --units effort=A or effort=mA"
             raise DataError(what, where=where, allowed=allowed, hint="add --units effort=A, or leave them out")
-        return np.ones(len(names))
-    factors = np.ones(len(names))
+        return factors
     for j, name in enumerate(names):
         own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
         if not own:
