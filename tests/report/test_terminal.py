@@ -252,7 +252,7 @@ def test_tables_are_aligned_without_empty_columns():
 
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     parameters = {"tau": {"value": 0.05, "std": None, "unit": "s"}}
-    entry = {"kind": "kelvin_voigt", "location": "T1", "score": 2190.0, "closure": None, "parameters": parameters}
+    entry = {"kind": "kelvin_voigt", "location": "T1", "closure": None, "parameters": parameters}
     which = [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}]
     known = {"summary": "There is a gap.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
     result = known | {"gap": {"before": {"rmse": {}, "unit": {}}}, "which": which}
@@ -263,7 +263,9 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     lines = told("yid-diagnosis/2", result | {"unseen": unseen})
     at = next(i for i, line in enumerate(lines) if "would not show" in line)
     assert "slip@grasp, friction (7 places), mass (7 places), " in " ".join(lines[at : at + 2])
-    refitted = told("yid-diagnosis/2", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
+    alike = {"which": [entry | {"closure": 0.5, "p_value": 0.0}], "effects": [entry]}
+    refitted, named = (told("yid-diagnosis/2", result | alike | {"verdict": own}) for own in ("confusable", "effect"))
+    assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)

@@ -80,13 +80,14 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
-    yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    order = "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the"
-    order += (
-        " held-out error beyond noise that the candidate removes (negative: adds). Values without ±: linear forecasts."
-    )
+    rows = [*_candidate_rows(result)]
+    yield SummaryTable(rows, "Candidates")
+    order = "Refitted candidates come first, by held-out error, then the others, by p. Values without ±: forecasts. "
+    order += "Closure alone: part of the held-out error beyond noise that it removes (negative: the error grows)."
     yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
-    yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
+    yield "p: probability that noise alone resembles the effect as much." if result["which"] else ""
+    possible = "Possible: not accepted yet, because another cause may explain the error as well."
+    yield possible if any("possible" in row for row in rows) else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
@@ -122,7 +123,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "candidate", "parameters", "closure alone", "score", "p"
+    yield "candidate", "parameters", "closure alone", "p", "verdict"
+    chosen = "accepted" if result["verdict"] == "effect" else "possible"
+    verdicts = {_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
+    verdicts |= {_label(own): chosen for own in result.get("effects", ())}
     absent = "–" * any(entry["closure"] is not None for entry in result["which"])
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
@@ -134,8 +138,12 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
                 shown = f"= {round(value, 12):.3g}{unit}" if entry["closure"] is None else "unknown"
                 values.append(f"{name} {shown}")
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-        numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
-        yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
+        label, p = _label(entry), p_value_text(entry["p_value"])
+        yield label, ", ".join(values), closed, p, verdicts.get(label, "")
+
+
+def _label(entry: Mapping[str, Any]) -> str:
+    return f"{entry['kind']}@{entry['location']}"
 
 
 @register_summary("yid-blind/1")
