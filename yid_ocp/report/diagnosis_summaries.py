@@ -440,18 +440,18 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
-        rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
+        rows.append((name, *cells, together, entry["unit"], p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield from _consistency_blocks(result)
 
 
 def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    heads = "chi2 of difference from the others", "degrees of freedom", "p", "largest in", "explained by model"
+    heads = "chi2 of difference from the others", "degrees of freedom", "p", "differs most in", "explained by model"
     rows: TableRows = [("run", *heads, "verdict")]
     for entry in history["runs"]:
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
-        verdict = "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
+        verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
         rows.append((entry["name"], *apart, *verdict))
     yield SummaryTable(rows, "Each run against the others")
     yield "A run that agrees has a chi2 near its degrees of freedom. p: probability that noise alone differs as much."
@@ -467,12 +467,15 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"All parameters together differ between the runs (p {p}), but no single parameter does significantly."
     for name in drifted:
         entry = result["parameters"][name]
-        values = [own["value"] for own in entry["values"].values()]
-        ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        limit = f"below {result['level'] / len(result['parameters']):.2g} is a change"
-        yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
+        (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
+        said = f"{name} differs between the runs, from {low:.4g} in {first} to {high:.4g} {entry['unit']} in {last}"
+        limit = f"it counts if p is below {result['level'] / len(result['parameters']):.2g}"
+        yield f"{said} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}, because the others agree much better without it."
+        names = " and ".join(wrong)
+        rest = abbreviated_names_text([entry["name"] for entry in runs if not entry["distrusted"]])
+        yield f"The other runs ({rest}) agree with each other much better than with {names}."
+        yield f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use {names}."
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
