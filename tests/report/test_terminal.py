@@ -185,11 +185,11 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
     lines = told("yid-compare/1", compared(methods=methods, judged=weak, published={"a": 1.0}))
     assert "Use no value, because these recordings determine no parameter." in lines
-    assert line_of(lines, "cost (in units of noise)").split()[-2:] == ["5", "failed"]
+    assert line_of(lines, "cost (half the sum of (error/noise)^2)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are"
+    said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     lines = told("yid-compare/1", compared())
     assert (lines[0], "All methods fit equally well, because their costs differ by 0 at most." in lines) == (said, True)
 
@@ -201,9 +201,9 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("Do not use the columns single_shooting, late, because these methods ignore noise")
-    assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting (more than 2 std away)." in lines
-    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "unit", "verdict"]
-    assert "a          7                stopped  9 ± 0.1  N m/rad  found" in lines
+    assert "a is 9 ± 0.1 N m/rad by the best fit, but 7 by single_shooting (more than 2 std away)." in lines
+    assert line_of(lines, "parameter").split()[2:6] == ["late", "best", "fit", "unit"]
+    assert "a          7                stopped  9 ± 0.1   N m/rad  found" in lines
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
 

@@ -311,7 +311,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
 @register_summary("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     methods, judged = result["methods"], result["judged"]
-    runs = methods | {"solve": judged}
+    runs = methods | {"best fit": judged}
     stopped = [m for m, e in methods.items() if e["status"] == "iteration_limit" and not e["iterations"]]
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
@@ -328,7 +328,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
-    agree = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are found."
+    agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
@@ -354,13 +354,13 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
-        yield "Use the column `solve`, which includes this noise and has the verdicts."
+        yield "Use the column `best fit`, which includes this noise and has the verdicts."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
             if off:
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
-                yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)} (more than 2 std away)."
+                yield f"{name} is {said} {e['unit']} by the best fit, but {', '.join(off)} (more than 2 std away)."
     if not fit["explains"]:
         yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
@@ -368,14 +368,15 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     elif not found:
         yield "Use no value, because these recordings determine no parameter."
     elif not result["agree"] and not result["disturbed"]:
-        yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
+        yield "The methods do not agree. Use the column `best fit`, whose cost is lowest (reasons: below the tables)."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
     yield "", *methods
     yield "status", *(entry["status"].replace("_", " ") for entry in entries)
-    yield "cost (in units of noise)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
+    costs = ("failed" if (x := entry["whitened_cost"]) is None else f"{x:.6g}" for entry in entries)
+    yield "cost (half the sum of (error/noise)^2)", *costs
     chi2 = "chi2 per degree of freedom (noise alone: 1)"
     yield chi2, *("unknown" if (x := e["fit"]["chi2_per_dof"]) is None else f"{x:.3g}" for e in entries)
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
