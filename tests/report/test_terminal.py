@@ -101,12 +101,15 @@ def test_a_solve_says_what_is_not_found():
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
     assert "Fix p there (parameters.p.free: false) if it is absent" in " ".join(gone.split())
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
-    lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
-    lines = told("yid-solve/1", lost)
-    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "from", "0"]
-    assert "±" not in "".join(lines[lines.index("") + 2 :])
+    issue = dict.fromkeys(("severity", "where", "certainty", "what", "advice"), "warning")
+    issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
+    both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
+    lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
+    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak)." in " ".join(lines)) == (True, True)
+    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "2"]
+    assert "±" not in "".join(lines[lines.index(line_of(lines, "a")) :])
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
-    parts = "the fit did not converge", "limit after 4 iterations in all", "2e+03 times the chi2 of noise, first"
+    parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"
     assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
@@ -170,8 +173,8 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
-    said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    rest = "With half the time step, no estimate would change by more than its ± from the recordings."
+    said = "With twice the links, these estimates would change by more than their ± without this error: p.a by"
+    rest = "With half the time step, no estimate would change by more than its ± without this error."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "To reduce these errors, set model.object.links: 8, and solve again."
     assert lines[at + 1 : at + 4] == ["-5.5 (± 0.073). The ± of the table includes this.", rest, cure]

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
     MAX_WEAK_RELATIVE_STD,
@@ -66,11 +66,12 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
-        fit = result["fit"]
+        fit, causes = result["fit"], grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
         said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
-        if said and any(issue["cause"] == "noise_overstated" for issue in result.get("issues") or ()):
+        if said and "noise_overstated" in causes:
             said = "The stated noise is too large to test whether the model explains the recordings."
-        found, doubts = (*_found_and_lost(free, is_safe, mild), said), (*notes, *predicted)
+        still = " ".join(causes.get("weak_excitation", ()))
+        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *predicted)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
@@ -105,7 +106,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
-    steps = count_with_noun(result["iterations"], "iteration") + " in all" * (result["status"] == "iteration_limit")
+    steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (
+        result["status"] == "iteration_limit"
+    )
     ended = f"{result['status'].replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
     yield f"{ended}: {result['message']}" if converged else ended
@@ -224,7 +227,8 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     return [channel for channel in errors if channel not in hidden]
 
 
-def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str) -> Iterator[str]:
+def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str, still: str) -> Iterator[str]:
+    """Yield sentences on parameters by verdict. `still` has settings that fix parameters of joints that hardly move."""
     found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         names = abbreviated_names_text(found)
@@ -234,7 +238,8 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
         none = "Use no value. " * (len(lost) == len(free))
-        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
+        causes = [name + " (motion too weak)" * (f"parameters.{name}.free" in still) for name in lost]
+        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(causes)}."
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
         text = f"These parameters are only weakly determined: {abbreviated_names_text(weak)}."
@@ -243,18 +248,23 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
-    by_bound = dict[tuple[str, bool], list[str]]()
+    by_bound = dict[tuple[str, str], list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
-                by_bound.setdefault((bound, entry[side] == 0), []).append(name)
-    for (bound, is_zero), names in by_bound.items():
+                remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
+                if entry[side] == 0:
+                    remedy = (
+                        "Fix {0} there (parameters.{0}.free: false) if it is absent. If not, look for another cause."
+                    )
+                elif entry["verdict"] == "not_identifiable":
+                    remedy = "Fix {0} at a known value, because these recordings do not determine it."
+                by_bound.setdefault((bound, remedy), []).append(name)
+    for (bound, remedy), names in by_bound.items():
         what, own = f"{abbreviated_names_text(names)} ended at the {bound}", names[0] if len(names) == 1 else "NAME"
-        remedy = f"Widen parameters.{own}.bounds, or fix {own} there if the bound is a physical limit."
-        if is_zero:
-            remedy = f"Fix {own} there (parameters.{own}.free: false) if it is absent. If not, look for another cause."
-        yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
+        said = f"{what}, so values beyond it were not tried and the other values may be wrong."
+        yield f"{said} {remedy.format(own)}"
 
 
 @register_summary("yid-identifiability/1")
