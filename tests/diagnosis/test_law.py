@@ -76,8 +76,7 @@ def test_a_torque_without_a_name_is_found_at_its_joint_as_a_function_of_its_quan
     assert law.tables[0].knots[0] < low < high < law.tables[0].knots[-1]
     [table], inner = law.tables, slice(2, -2)
     least, at = min((f, x) for f, x in zip(table.torque, table.knots, strict=True) if low <= x <= high)
-    said = f"depends on the {quantity} of elbow (from {least:.2g} N m at {at:.2g} rad"
-    assert said in found.summary
+    assert f"depends on the {quantity} of elbow (from {least:.2g} N m at {at:.2g} rad" in found.summary
     assert np.all(np.abs(table.torque - truth(table.knots, table.knots))[inner] < 3 * table.torque_std[inner] + 0.02)
 
 

@@ -189,20 +189,17 @@ def _rms(values: Sequence[float]) -> float | None:
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    errors = []
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
+    named = list[str]()
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
+            unit, noise = channel_or_group_unit(units, channel), entry.get("expected", {}).get(channel)
             guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
-            noise = entry.get("expected", {}).get(channel)
-            errors.append((entry["recording"], channel, entry["rmse"][channel], noise, guesses))
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
-    for recording, channel, rmse, noise, guesses in errors:
-        unit = channel_or_group_unit(units, channel)
-        without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        error, shown = value_text_and_display_unit(rmse, unit)
-        by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
-        rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
-    named = dict.fromkeys(name for *_, guesses in errors for name in guesses)
+            named += [name for name in guesses if name not in named]
+            without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+            error, shown = value_text_and_display_unit(entry["rmse"][channel], unit)
+            by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
+            rows.append((entry["recording"], channel, error, by_noise, shown, ", ".join(without)))
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
@@ -212,7 +209,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     moved = ", and errors of the torques that move the arm (a fit estimates them on its own recordings only)"
     moved *= bool(result.get("torque_offsets"))
     said = f"noise alone: the error by noise of the sensors{moved}. Up to twice this is no gap."
-    yield said if any(noise is not None for *_, noise, _ in errors) else ""
+    yield said if any(row[3] for row in rows[1:]) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -274,7 +271,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± with initial state and grasps estimated too", "± with all else known")
+    unsure = ("± [of the value]", "± with initial state (and any grasps) estimated too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
@@ -298,7 +295,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield "" if is_initial else "The ± leave out the errors of links and time step, which those of `solve` include."
+    left_out = "the time step is finite, and so is the number of links of a flexible object"
+    yield "" if is_initial else f"The ± leave out errors that `solve` includes: {left_out}."
     meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
     yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
