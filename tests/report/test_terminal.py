@@ -101,11 +101,10 @@ def test_a_solve_says_what_is_not_found():
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
     assert "Fix p there (parameters.p.free: false) if it is absent" in " ".join(gone.split())
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
-    issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning") | {
-        "cause": "weak_excitation"
-    }
+    issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning")
+    issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
     both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
-    lines = told("yid-solve/1", solved(parameters=both, issues=[issue | {"setting": "parameters.a.free: false"}]))
+    lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
     assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak)." in " ".join(lines)) == (True, True)
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "2"]
     assert "±" not in "".join(lines[lines.index(line_of(lines, "a")) :])
