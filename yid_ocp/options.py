@@ -131,9 +131,10 @@ def _words(hint: Any) -> str:
         count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
         return f"a list{count}, each {_words(arguments[0])}".replace(", each a section", " of sections", 1)
     if mapping_value_type(bare) is not None:
-        choice = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
-        known = f", each NAME one of {', '.join(choice[0].registry)}" if choice else ""
-        return f"{{NAME: {'{}' if choice else _words(mapping_value_type(bare))}, ...}}{known}"
+        choices = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
+        names = [name for own in choices for name in own.registry]
+        known = f", such as {{{names[0]}: {{}}}}, each NAME one of {', '.join(names)}" if choices else ""
+        return f"{{NAME: {'{}' if choices else _words(mapping_value_type(bare))}, ...}}{known}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
     needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
     return "a section" + f", such as {{{needed}}}" * bool(needed)

@@ -101,12 +101,15 @@ def test_a_solve_says_what_is_not_found():
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
     assert "Fix p there (parameters.p.free: false) if it is absent" in " ".join(gone.split())
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
-    lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
-    lines = told("yid-solve/1", lost)
-    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "from", "0"]
-    assert "±" not in "".join(lines[lines.index("") + 2 :])
+    issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning")
+    issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
+    both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
+    lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
+    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak)." in " ".join(lines)) == (True, True)
+    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "2"]
+    assert "±" not in "".join(lines[lines.index(line_of(lines, "a")) :])
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
-    parts = "the fit did not converge", "limit after 4 iterations in all", "2e+03 times the chi2 of noise, first"
+    parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"
     assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
@@ -174,8 +177,8 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
-    said = "With twice the links, these estimates would change by more than their ± from the recordings: p.a by"
-    rest = "With half the time step, no estimate would change by more than its ± from the recordings."
+    said = "With twice the links, these estimates would change by more than their ± without this error: p.a by"
+    rest = "With half the time step, no estimate would change by more than its ± without this error."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "To reduce these errors, set model.object.links: 8, and solve again."
     assert lines[at + 1 : at + 4] == ["-5.5 (± 0.073). The ± of the table includes this.", rest, cure]
@@ -189,11 +192,11 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
     lines = told("yid-compare/1", compared(methods=methods, judged=weak, published={"a": 1.0}))
     assert "Use no value, because these recordings determine no parameter." in lines
-    assert line_of(lines, "cost (in units of noise)").split()[-2:] == ["5", "failed"]
+    assert line_of(lines, "cost (half the sum of (error/noise)^2)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are"
+    said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     lines = told("yid-compare/1", compared())
     assert (lines[0], "All methods fit equally well, because their costs differ by 0 at most." in lines) == (said, True)
 
@@ -205,9 +208,9 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("Do not use the columns single_shooting, late, because these methods ignore noise")
-    assert "a is 9 ± 0.1 N m/rad by `solve`, but 7 by single_shooting (more than 2 std away)." in lines
-    assert line_of(lines, "parameter").split() == ["parameter", "single_shooting", "late", "solve", "unit", "verdict"]
-    assert "a          7                stopped  9 ± 0.1  N m/rad  found" in lines
+    assert "a is 9 ± 0.1 N m/rad by the best fit, but 7 by single_shooting (more than 2 std away)." in lines
+    assert line_of(lines, "parameter").split()[2:6] == ["late", "best", "fit", "unit"]
+    assert "a          7                stopped  9 ± 0.1   N m/rad  found" in lines
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
 
@@ -256,18 +259,19 @@ def test_tables_are_aligned_without_empty_columns():
 
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     parameters = {"tau": {"value": 0.05, "std": None, "unit": "s"}}
-    entry = {"kind": "kelvin_voigt", "location": "T1", "score": 2190.0, "closure": None, "parameters": parameters}
+    entry = {"kind": "kelvin_voigt", "location": "T1", "closure": None, "parameters": parameters}
     which = [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}]
     known = {"summary": "There is a gap.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
     result = known | {"gap": {"before": {"rmse": {}, "unit": {}}}, "which": which}
     lines = told("yid-diagnosis/2", result)
-    assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
-    assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
+    assert [line_of(lines, f"kelvin_voigt@{at}")[-7:] for at in ("T1", "T2")] == ["< 1e-12", "  0.034"]
     unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
     lines = told("yid-diagnosis/2", result | {"unseen": unseen})
     at = next(i for i, line in enumerate(lines) if "would not show" in line)
     assert "slip@grasp, friction (7 places), mass (7 places), " in " ".join(lines[at : at + 2])
-    refitted = told("yid-diagnosis/2", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
+    alike = {"which": [entry | {"closure": 0.5, "p_value": 0.0}], "effects": [entry]}
+    refitted, named = (told("yid-diagnosis/2", result | alike | {"verdict": own}) for own in ("confusable", "effect"))
+    assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)

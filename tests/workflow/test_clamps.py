@@ -178,11 +178,11 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, printed):
     folders = [folder_of(tmp_path / f"day{i}", values=(0.02 if i < 3 else 0.025, 5e-5)) for i in range(4)]
     told = printed("report", *folders, "--out", tmp_path / "history", "--json")
     written = json.loads((tmp_path / "history" / "history.json").read_text(encoding="utf-8"))
-    assert written["format"] == "yid-history/1"
-    assert json.loads(told) == written
+    assert (written["format"], json.loads(told)) == ("yid-history/1", written)
     assert [name for name, entry in written["parameters"].items() if entry["drifted"]] == ["beam.bend"]
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == ["day3"]
-    assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
+    assert all(own in page for own in ("differs between the runs, from 0.02 in day0 to 0.025", "(day0..2) agree with"))
     later, older = (folder_of(tmp_path / name) for name in ("later", "older"))
     (later / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{baseline_run_folders: [{folders[0]}]}}\n", "utf-8")
     (older / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{worth: 3}}\n", "utf-8")

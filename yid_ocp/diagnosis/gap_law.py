@@ -62,21 +62,21 @@ class NonparametricLaw:
     @property
     def sentence(self) -> str:
         """A sentence about the law that states its location, quantity and size, and the closed fraction of the gap."""
-        is_over_time = self.depends_on == "time"
-        words = "time" if is_over_time else f"its {' and its '.join(t.quantity for t in self.tables)}"
-        end = " It may come from outside the model, because no law of motion or load predicts it better."
+        names, is_over_time = " and ".join(t.quantity for t in self.tables), self.depends_on == "time"
+        words = "time" if is_over_time else f"the {names} of {self.location}"
         sizes = []
         for table in self.tables:
             low, high = self.visited_range[table.quantity]
             seen = (table.knots >= low) & (table.knots <= high)
-            torque, unit = table.torque[seen], TORQUE_LAW_QUANTITY_UNITS[table.quantity]
+            at, torque, unit = table.knots[seen], table.torque[seen], TORQUE_LAW_QUANTITY_UNITS[table.quantity]
             if len(torque):
-                ends = f"from {torque.min():.2g} to {torque.max():.2g} N m"
-                sizes.append(f"{ends} between {low:.2g} and {high:.2g} {unit}")
+                ends = (f"{torque[i]:.2g} N m at {at[i]:.2g} {unit}" for i in (torque.argmin(), torque.argmax()))
+                sizes.append(f"from {' to '.join(ends)}")
         gap = f"error beyond noise{' that the effects leave' * self.has_accepted_effects} on held-out motions"
-        closed = f"would remove {100 * self.closure.fraction:.3g} % of the {gap}"
-        head = f"A torque at {self.location} that depends on {words}"
-        return f"{head} ({', '.join(sizes)}) {closed}. No accepted effect describes this torque.{end * is_over_time}"
+        head = f"The error looks like a torque at {self.location} that depends on {words} ({', '.join(sizes)})."
+        closed = f"It would remove {100 * self.closure.fraction:.3g} % of the {gap}. No accepted effect describes it."
+        end = " It may come from outside the model, because no law of motion or load predicts it better." * is_over_time
+        return f"{head} {closed}{end} Allow more effects (diagnosis.candidates), or add law.csv to the model."
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""

@@ -45,8 +45,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
     still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
-    movable = " or ".join([name for name in first if name not in still])
-    most = f"Record slow and fast motions, with pauses, and most motion at {movable} (where the gap is)."
+    movable = ", ".join([name for name in first if name not in still])
+    most = f"Record slow and fast motions, with pauses, and most motion where the gap is (part or grasp): {movable}."
     larger = "Record faster and larger motions of all joints, which show more effects."
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
@@ -232,7 +232,7 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = "no effect that was tried explains the error well enough"
+    tried = f"no effect that was tried both has a size above {limits.min_z:g} ± and explains the error well enough"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is less than {limits.min_z:g} ± from no effect"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)

@@ -80,13 +80,14 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Events (pushes and wrong samples)")
-    yield SummaryTable([*_candidate_rows(result)], "Candidates")
-    order = "Refitted candidates come first, by held-out error, then the others, by p. Closure alone: part of the"
-    order += (
-        " held-out error beyond noise that the candidate removes (negative: adds). Values without ±: linear forecasts."
-    )
+    rows = [*_candidate_rows(result)]
+    yield SummaryTable(rows, "Candidates")
+    order = "Refitted candidates come first, by held-out error, then the others, by p. Values without ±: forecasts. "
+    order += "Closure alone: part of the held-out error beyond noise that it removes (negative: the error grows)."
     yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
-    yield "Score: test statistic of a candidate. p: probability of this score by noise." if result["which"] else ""
+    yield "p: probability that noise alone resembles the effect as much." if result["which"] else ""
+    possible = "Possible: not accepted yet, because another cause may explain the error as well."
+    yield possible if any("possible" in row for row in rows) else ""
     yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
@@ -124,7 +125,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "candidate", "parameters", "closure alone", "score", "p"
+    yield "candidate", "parameters", "closure alone", "p", "verdict"
+    chosen = "accepted" if result["verdict"] == "effect" else "possible"
+    verdicts = {_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
+    verdicts |= {_label(own): chosen for own in result.get("effects", ())}
     absent = "–" * any(entry["closure"] is not None for entry in result["which"])
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
@@ -136,8 +140,12 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
                 shown = f"= {round(value, 12):.3g}{unit}" if entry["closure"] is None else "unknown"
                 values.append(f"{name} {shown}")
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-        numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
-        yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
+        label, p = _label(entry), p_value_text(entry["p_value"])
+        yield label, ", ".join(values), closed, p, verdicts.get(label, "")
+
+
+def _label(entry: Mapping[str, Any]) -> str:
+    return f"{entry['kind']}@{entry['location']}"
 
 
 @register_summary("yid-blind/1")
@@ -305,7 +313,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
 @register_summary("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     methods, judged = result["methods"], result["judged"]
-    runs = methods | {"solve": judged}
+    runs = methods | {"best fit": judged}
     stopped = [m for m, e in methods.items() if e["status"] == "iteration_limit" and not e["iterations"]]
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
@@ -322,7 +330,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
-    agree = "Use the column `solve` (the best fit): all methods agree within their ± on the parameters that are found."
+    agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
@@ -348,13 +356,13 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
-        yield "Use the column `solve`, which includes this noise and has the verdicts."
+        yield "Use the column `best fit`, which includes this noise and has the verdicts."
         for name, e in found.items():
             values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
             if off:
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
-                yield f"{name} is {said} {e['unit']} by `solve`, but {', '.join(off)} (more than 2 std away)."
+                yield f"{name} is {said} {e['unit']} by the best fit, but {', '.join(off)} (more than 2 std away)."
     if not fit["explains"]:
         yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
@@ -362,14 +370,15 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     elif not found:
         yield "Use no value, because these recordings determine no parameter."
     elif not result["agree"] and not result["disturbed"]:
-        yield "The methods do not agree. Use the column `solve`, whose cost is lowest (reasons: below the tables)."
+        yield "The methods do not agree. Use the column `best fit`, whose cost is lowest (reasons: below the tables)."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
     yield "", *methods
     yield "status", *(entry["status"].replace("_", " ") for entry in entries)
-    yield "cost (in units of noise)", *("failed" if (x := e["whitened_cost"]) is None else f"{x:.6g}" for e in entries)
+    costs = ("failed" if (x := entry["whitened_cost"]) is None else f"{x:.6g}" for entry in entries)
+    yield "cost (half the sum of (error/noise)^2)", *costs
     chi2 = "chi2 per degree of freedom (noise alone: 1)"
     yield chi2, *("unknown" if (x := e["fit"]["chi2_per_dof"]) is None else f"{x:.3g}" for e in entries)
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
@@ -434,18 +443,18 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
-        rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
+        rows.append((name, *cells, together, entry["unit"], p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     yield from _consistency_blocks(result)
 
 
 def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    heads = "chi2 of difference from the others", "degrees of freedom", "p", "largest in", "explained by model"
+    heads = "chi2 of difference from the others", "degrees of freedom", "p", "differs most in", "explained by model"
     rows: TableRows = [("run", *heads, "verdict")]
     for entry in history["runs"]:
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
-        verdict = "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
+        verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
         rows.append((entry["name"], *apart, *verdict))
     yield SummaryTable(rows, "Each run against the others")
     yield "A run that agrees has a chi2 near its degrees of freedom. p: probability that noise alone differs as much."
@@ -461,12 +470,15 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"All parameters together differ between the runs (p {p}), but no single parameter does significantly."
     for name in drifted:
         entry = result["parameters"][name]
-        values = [own["value"] for own in entry["values"].values()]
-        ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        limit = f"below {result['level'] / len(result['parameters']):.2g} is a change"
-        yield f"{name} is not the same in all runs: {ends} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
+        (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
+        said = f"{name} differs between the runs, from {low:.4g} in {first} to {high:.4g} {entry['unit']} in {last}"
+        limit = f"it counts if p is below {result['level'] / len(result['parameters']):.2g}"
+        yield f"{said} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
-        yield f"Do not trust {' and '.join(wrong)}, because the others agree much better without it."
+        names = " and ".join(wrong)
+        rest = abbreviated_names_text([entry["name"] for entry in runs if not entry["distrusted"]])
+        yield f"The other runs ({rest}) agree with each other much better than with {names}."
+        yield f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use {names}."
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."

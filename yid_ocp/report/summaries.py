@@ -66,11 +66,12 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
         is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
-        fit = result["fit"]
+        fit, causes = result["fit"], grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
         said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
-        if said and any(issue["cause"] == "noise_overstated" for issue in result.get("issues") or ()):
+        if said and "noise_overstated" in causes:
             said = "The stated noise is too large to test whether the model explains the recordings."
-        found, doubts = (*_found_and_lost(free, is_safe, mild), said), (*notes, *predicted)
+        still = " ".join(causes.get("weak_excitation", ()))
+        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *predicted)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
@@ -105,7 +106,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
-    steps = count_with_noun(result["iterations"], "iteration") + " in all" * (result["status"] == "iteration_limit")
+    steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (
+        result["status"] == "iteration_limit"
+    )
     ended = f"{result['status'].replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
     yield f"{ended}: {result['message']}" if converged else ended
@@ -186,20 +189,17 @@ def _rms(values: Sequence[float]) -> float | None:
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    errors = []
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
+    named = list[str]()
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
+            unit, noise = channel_or_group_unit(units, channel), entry.get("expected", {}).get(channel)
             guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
-            noise = entry.get("expected", {}).get(channel)
-            errors.append((entry["recording"], channel, entry["rmse"][channel], noise, guesses))
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
-    for recording, channel, rmse, noise, guesses in errors:
-        unit = channel_or_group_unit(units, channel)
-        without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        error, shown = value_text_and_display_unit(rmse, unit)
-        by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
-        rows.append((recording, channel, error, by_noise, shown, ", ".join(without)))
-    named = dict.fromkeys(name for *_, guesses in errors for name in guesses)
+            named += [name for name in guesses if name not in named]
+            without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+            error, shown = value_text_and_display_unit(entry["rmse"][channel], unit)
+            by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
+            rows.append((entry["recording"], channel, error, by_noise, shown, ", ".join(without)))
     legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
@@ -209,7 +209,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     moved = ", and errors of the torques that move the arm (a fit estimates them on its own recordings only)"
     moved *= bool(result.get("torque_offsets"))
     said = f"noise alone: the error by noise of the sensors{moved}. Up to twice this is no gap."
-    yield said if any(noise is not None for *_, noise, _ in errors) else ""
+    yield said if any(row[3] for row in rows[1:]) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -224,7 +224,8 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     return [channel for channel in errors if channel not in hidden]
 
 
-def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str) -> Iterator[str]:
+def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: str, still: str) -> Iterator[str]:
+    """Yield sentences on parameters by verdict. `still` has settings that fix parameters of joints that hardly move."""
     found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         names = abbreviated_names_text(found)
@@ -234,7 +235,8 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
     if lost:
         none = "Use no value. " * (len(lost) == len(free))
-        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(lost)}."
+        causes = [name + " (motion too weak)" * (f"parameters.{name}.free" in still) for name in lost]
+        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(causes)}."
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
         text = f"These parameters are only weakly determined: {abbreviated_names_text(weak)}."
@@ -243,18 +245,23 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
-    by_bound = dict[tuple[str, bool], list[str]]()
+    by_bound = dict[tuple[str, str], list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
-                by_bound.setdefault((bound, entry[side] == 0), []).append(name)
-    for (bound, is_zero), names in by_bound.items():
+                remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
+                if entry[side] == 0:
+                    remedy = (
+                        "Fix {0} there (parameters.{0}.free: false) if it is absent. If not, look for another cause."
+                    )
+                elif entry["verdict"] == "not_identifiable":
+                    remedy = "Fix {0} at a known value, because these recordings do not determine it."
+                by_bound.setdefault((bound, remedy), []).append(name)
+    for (bound, remedy), names in by_bound.items():
         what, own = f"{abbreviated_names_text(names)} ended at the {bound}", names[0] if len(names) == 1 else "NAME"
-        remedy = f"Widen parameters.{own}.bounds, or fix {own} there if the bound is a physical limit."
-        if is_zero:
-            remedy = f"Fix {own} there (parameters.{own}.free: false) if it is absent. If not, look for another cause."
-        yield f"{what}, so values beyond it were not tried and the other values may be wrong. {remedy}"
+        said = f"{what}, so values beyond it were not tried and the other values may be wrong."
+        yield f"{said} {remedy.format(own)}"
 
 
 @register_summary("yid-identifiability/1")

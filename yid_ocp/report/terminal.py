@@ -129,7 +129,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
-        yield f"The verdicts do not account for these issues, so follow their advice before you use values: {mild}."
+        yield f"Before you use values, follow the advice below on these issues, which the verdicts leave out: {mild}."
     yield SummaryTable(rows, "Issues of the recordings")
     yield from advice
 
@@ -211,13 +211,13 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         worst = sorted(moved.items(), key=lambda item: -abs(item[1][key]) / item[1]["std"])
         changes = [f"{n} by {e[key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {e['std']:.2g})" for n, e in worst]
         if moved:
-            text = f"With {words}, these estimates would change by more than their ± from the recordings: "
+            text = f"With {words}, these estimates would change by more than their ± without this error: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The ± of the table includes this.")
         elif tried:
             quiet.append(words)
     if quiet:
-        said.append(f"With {' or '.join(quiet)}, no estimate would change by more than its ± from the recordings.")
+        said.append(f"With {' or '.join(quiet)}, no estimate would change by more than its ± without this error.")
     return said + ([f"To reduce these errors, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 

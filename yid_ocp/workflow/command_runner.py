@@ -136,13 +136,14 @@ class _RemainingTime:
         self._work, self.n_iterates, self._first = work, 0, None
 
     def of_command(self) -> str:
-        """Return the text of the command's remaining time. Empty if its stages do not state their usual time.
+        """Return the text of the command's remaining time. Empty before a stage or an iteration is measured.
 
         After a plan has grown, it is the elapsed time: a search that repeats its stages can grow many times.
         """
         if self._has_grown:
             return f", {time.monotonic() - self._start_of_command:.0f} s so far"
-        return f", about {_format_duration(left)} left" if (left := self.seconds_left()) >= _MIN_ESTIMATE_TIME else ""
+        left = self.seconds_left() if self.n_iterates or self._usual != _USUAL_IMPORT_TIME else 0.0
+        return f", about {_format_duration(left)} left" if left >= _MIN_ESTIMATE_TIME else ""
 
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual

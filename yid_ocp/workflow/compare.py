@@ -22,7 +22,8 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment_name
     if not solvers:
         what, allowed = "compare.methods lists no method", ", ".join(SOLVERS)
-        raise run.config_error(what, "compare", "methods", allowed=allowed, hint="add a method, or leave the key out")
+        hint = "add a method, such as {gauss_newton: {}}, or leave the key out"
+        raise run.config_error(what, "compare", "methods", allowed=allowed, hint=hint)
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"Caldwell et al. (2014) have no experiment '{experiment}'"
         allowed, hint = ", ".join(PAPER_ESTIMATES), "use an allowed name, or leave the key out"

@@ -213,7 +213,7 @@ def _summary_lines(
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
     if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(f"`diagnose` does not test these effects, as no recorded signal shows them: {', '.join(kinds)}.")
+        lines.append(f"`diagnose` skips effects that no signal shows (matters if you expect one): {', '.join(kinds)}.")
     has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "

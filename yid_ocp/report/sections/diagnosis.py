@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
-from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm, value_text_and_display_unit
+from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm
 
 if TYPE_CHECKING:
     from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -63,26 +63,11 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         extended = after[channel][0] if changed and channel in after else None
         errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "noise alone": floor.get(channel)}
         rows.append((channel, shown, {name: (factor * e, None) for name, e in errors.items() if e is not None}))
-    first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
-    sentences = []
-    if changed:
-        names = ", ".join(effect.label for effect in finding.accepted_effects)
-        is_left = finding.remaining_test.p_value < finding.thresholds.significance_level
-        rest = "Predictions still err by more than noise" if is_left else "Noise and the ± explain what remains"
-        falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
-        change = f"goes from {first:.3g} to {last:.3g} (noise alone gives 1)"
-        sentences.append(f"{rest}: with {names}, chi² per degree of freedom of held-out recordings {change}.")
-        if falls:
-            most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
-            sizes = (" ".join(value_text_and_display_unit(*model[most])) for model in (before, after))
-            worse = f". The error of {least} rises by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
-            sentences.append(f"The error of {most} changes most, from {' to '.join(sizes)}{worse}.")
-    else:
-        level = f"Its chi² per degree of freedom is {first:.3g} (noise alone gives 1)"
-        sentences.append(f"No effect is accepted as cause, so the figure has the nominal model alone. {level}.")
+    sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
+    if not changed:
+        sentences.append("No effect is accepted as cause, so the figure has the nominal model alone.")
         tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
         sentences.append(f"The table above also has the errors with {tried}, not accepted as cause." if tried else "")
-    sentences.append("The figure shows rms errors on held-out recordings, and the part of them from noise alone.")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
@@ -104,13 +89,11 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
     noticed = ", ".join(p.location for p in finding.gap_locations if p.is_observable and p.gap_share < MIN_GAP_SHARE)
     silent = ", ".join(place.location for place in finding.gap_locations if not place.is_observable)
     evidence, origin = smoothed.log_evidence, GAP_ORIGIN_TEXTS[smoothed.plant_or_sensor_origin]
-    left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     sentences = [
         f"Most probably the gap of the {_NOMINAL_LABEL} comes from {origin}.",
         gap_locations_sentence(finding),
         f"Nothing is wrong at {noticed}: a gap would have been detected there." if noticed else "",
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
-        f"What the effects leave is mostly at {', '.join(left)}." if finding.accepted_effects and left else "",
         "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
         "change over time, are added, as few as explain the residual. They explain "
         f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap on fitted recordings. The log evidence rises by "
@@ -217,12 +200,10 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     why = ", because they show no error beyond noise" if fit.held_out_loss.excess_chi2_per_sample <= 0 else ""
     unmeasured = f"Refitted: {refitted}. Held-out motions cannot show how much of the gap these effects close{why}."
     sentences = [f"Bars show {promise}", unmeasured if refitted else "No effect promises enough for a refit."]
-    if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
-        best = sorted(done, key=lambda entry: -entry[1][0])[:3]
-        said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
+    if any(closed is not None for closed, _ in entries.values()):
         sentences = [
             "The left part shows how much of the held-out gap each effect alone closes, refitted with the parameters, "
-            f"with 95 % intervals. At 100 % no gap is left. Below 0 % predictions get worse. The best are {said}.",
+            "with 95 % intervals. At 100 % no gap is left. Below 0 % predictions get worse.",
             f"The right part shows {promise}",
         ]
     # room for one word on a narrow screen
@@ -337,16 +318,11 @@ def _curves(
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     if not finding.accepted_effects or not finding.nominal_parameters_before_and_after:
         return None
-    rows, moved = [], []
+    rows = []
     for name, entry in finding.nominal_parameters_before_and_after.items():
-        std, before, after = finding.nominal_model.std.get(name, 0.0), entry["before"], entry["after"]
-        values = {"fitted without the effects": (before, std), _EXTENDED_LABEL: (after, entry["std"])}
+        fitted_without = entry["before"], finding.nominal_model.std.get(name, 0.0)
+        values = {"fitted without the effects": fitted_without, _EXTENDED_LABEL: (entry["after"], entry["std"])}
         rows.append((name, entry["unit"], values))
-        if abs(after - before) > 0.1 * max(abs(before), 1e-9):
-            text = f"{name} goes from {before:.3g} to {after:.3g} {entry['unit']}".removesuffix(" 1")
-            moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     shown = _figures_by_model(rows, "value", "fitted without the effects")
-    said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     drawn = "A fit without the effects changes free parameters to imitate them. Bars are two standard deviations."
-    sentences = [drawn, f"{said}." if said else "No parameter changes by more than 10 %."]
-    return "Parameters that imitated the effects", sentences, shown
+    return "Parameters that imitated the effects", [drawn], shown

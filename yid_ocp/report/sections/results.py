@@ -124,7 +124,7 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
         if entry["free"] and entry["verdict"] != "not_identifiable":
             own = {method: findings.result["methods"][method]["parameters"][name] for method in ended}
             values = {m: (e["value"], None if comparison.has_process_noise else e["std"]) for m, e in own.items()}
-            rows.append((name, entry["unit"], values | {"solve": (entry["value"], entry["std"])}))
+            rows.append((name, entry["unit"], values | {"best fit": (entry["value"], entry["std"])}))
     yield from (("Estimates", own) for _, own in draw_figure_per_unit(rows, figures.parameter_values_by_source_figure))
     costs = {}
     for run in comparison.method_results:
