@@ -108,8 +108,9 @@ def diagnose(
         search = RefitContext(composed, thresholds, progress, store, deadline, batched, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
-        nominal = fit_nominal_model(problem, composed, solution, store, thresholds)
-        return _diagnosed(problem, _examined(search, nominal), earlier)
+        # no name for the fit, whose Jacobian would fill the memory to the end
+        seen = _examined(search, fit_nominal_model(problem, composed, solution, store, thresholds))
+        return _diagnosed(problem, seen, earlier)
 
 
 @dataclass(frozen=True)

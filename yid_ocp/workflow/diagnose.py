@@ -92,7 +92,8 @@ def run_diagnose(
             if run.diagnosis.noise_fraction_of_stated_std < 1 and problem.held_out:
                 # in units of noise, the solver would reject any fit and restart
                 logged.begin_stage("solving the nominal model", 5.0, 19.5)
-                nominal = fit_problem(problem, run.solver, callback=logged.report_iterate)
+                # without the evaluation, whose Jacobian would fill the memory
+                nominal = replace(fit_problem(problem, run.solver, callback=logged.report_iterate), evaluation=None)
             finding = diagnose(
                 _with_noise_only_stds(problem, run),
                 run.diagnosis.candidates,
