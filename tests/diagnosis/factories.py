@@ -164,7 +164,7 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=N
 
 def carried(of: EffectBase, values=(0.5, 0.9), stds=(0.01, 0.02)) -> EffectAmplitudeTransferCheck:
     """The amplitude of an effect on the recordings to estimate on and on the held-out ones."""
-    return EffectAmplitudeTransferCheck(of, f"{of.label}.a", *np.ravel([values, stds], "F"))
+    return EffectAmplitudeTransferCheck(of, f"{of.label}.a", *zip(values, stds, strict=True))
 
 
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")

@@ -10,9 +10,9 @@ from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, 
 from yid_ocp.inference.smoother import (
     gap_locations_by_smoother_evidence,
     gap_locations_from_closures_and_smoother,
-    interval_edges_names_and_z_scores,
     merge_time_intervals,
     smoothed_unknown_units,
+    smoothed_unknown_z_scores,
 )
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 
@@ -117,9 +117,7 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 )
 def test_only_informed_values_are_on_the_map(variance, std, mean, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
-    edges, names, values = interval_edges_names_and_z_scores(found)
-    np.testing.assert_allclose(values, [[expected]])
-    assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
+    np.testing.assert_allclose(smoothed_unknown_z_scores(found, found.smoothed_unknowns[0]), [[expected]])
 
 
 def test_units_of_unknowns_are_those_of_their_joints_or_metres():

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
-from factories import added, amplitude, cases, effect, finding, fit, loss, place, score, screening
+from factories import added, amplitude, cases, effect, finding, fit, loss, score, screening
 
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import CaseGroundTruth, UnlabelledCase, labels_json_and_sha256, read_labels_checking_sha256
@@ -87,17 +87,17 @@ def test_what_is_right_depends_on_the_case(case, answer, right):
 
 
 @pytest.mark.parametrize(
-    ("listed", "where", "first", "second", "located"),
+    ("listed", "where", "first", "located"),
     [
-        ([RIGHT, WRONG], ["T1", "T2"], True, True, True),
-        ([WRONG, RIGHT], ["T2", "T1"], False, True, False),
-        ([WRONG, "a@b", RIGHT], ["T1"], False, False, True),
-        ([], [], False, False, False),
+        ([RIGHT, WRONG], ["T1", "T2"], True, True),
+        ([WRONG, RIGHT], ["T2", "T1"], False, False),
+        ([WRONG, "a@b", RIGHT], ["T1"], False, True),
+        ([], [], False, False),
     ],
 )
-def test_a_mark_says_what_comes_first(listed, where, first, second, located):
+def test_a_mark_says_what_comes_first(listed, where, first, located):
     found = score_blind_case(label("single", KV), said("unknown", [], which=listed, where=where))
-    assert (found.kind_first, found.kind_second, found.location_first) == (first, second, located)
+    assert (found.kind_first, found.location_first) == (first, located)
 
 
 def test_a_mark_keeps_case_answer_and_figures():
@@ -141,7 +141,7 @@ def test_parameters_that_cannot_be_compared_are_left_out(injected, effects, valu
 
 def marked(category, **changed):
     words = {"case": "c", "truth": RIGHT, "verdict": "effect", "answer": RIGHT, "confusable": ()}
-    ranks = dict.fromkeys(("gap", "kind_first", "kind_second", "location_first", "right"), True)
+    ranks = dict.fromkeys(("gap", "kind_first", "location_first", "right"), True)
     usual = {**words, **ranks, "multiple": 3.0, "closure": 0.9, "best": 1.0}
     return blind_scores.BlindCaseScore(category=category, **(usual | changed))
 
@@ -154,7 +154,7 @@ def test_rates_are_over_the_cases_that_they_speak_of():
             marked("null", gap=False, seconds=4.0),
             marked("null", gap=False, seconds=8.0),
             marked("single", kind_first=False, location_first=False, errors={"a": (0.5, True), "b": (0.1, False)}),
-            marked("single", kind_first=False, kind_second=False, closure=0.3, best=0.5, errors={"a": (0.2, True)}),
+            marked("single", kind_first=False, closure=0.3, best=0.5, errors={"a": (0.2, True)}),
             marked("single", confusable=(WRONG, RIGHT), closure=math.nan),
             marked("single", confusable=(WRONG, "a@b", "c@d"), right=False, best=math.nan),
             marked("single", gap=False, right=False, multiple=1.0, kind_first=False, best=-1.0),
@@ -170,23 +170,21 @@ def test_rates_are_over_the_cases_that_they_speak_of():
         ]
     )
     assert found["cases"] == len(found["marks"]) == 18
-    assert found["detection"] == {
-        "1": {"cases": 1, "gap": 0.0, "first": 0.0, "right": 0.0},
-        "3": {"cases": 4, "gap": 1.0, "first": 0.5, "right": 0.75},
-    }
+    seen = found["detection_intervals"]
+    shares = {size: [own["gap"]["of"], *(part["rate"] for part in own.values())] for size, own in seen.items()}
+    assert shares == {"1": [1, 0.0, 0.0, 0.0], "3": [4, 1.0, 0.5, 0.75]}
     rates = {
-        "false_alarms": 0.25, "kind_first": 3 / 5, "kind_in_two": 4 / 5, "location_first": 4 / 5, "sets_cover": 0.8,
-        "set_size": 1.6, "unknown_recall": 1 / 3, "unknown_outside": 1.0, "unknown_left_out": 0.0,
-        "unknown_location": 0.5, "pairs_right": 0.5, "pairs_named": 0.25, "closure_of_best": (0.9 + 0.6) / 2,
-        "parameter_error": 0.2, "interval_coverage": 2 / 3, "seconds": 6.0,
+        "false_alarms": 0.25, "detected": 5 / 6, "kind_first": 3 / 5, "location_first": 4 / 5, "sets_cover": 0.8,
+        "unknown_outside": 1.0, "unknown_left_out": 0.0, "unknown_location": 0.5, "pairs_right": 0.5,
+        "interval_coverage": 2 / 3,
     }  # fmt: skip
-    assert {name: found[name] for name in rates} == pytest.approx(rates), (
-        "an effect that is named alone is a set of one"
-    )
+    assert {name: own["rate"] for name, own in found["intervals"].items()} == pytest.approx(rates)
+    sizes = {"set_size": 1.6, "closure_of_best": (0.9 + 0.6) / 2, "parameter_error": 0.2, "seconds": 6.0}
+    assert {name: found[name] for name in sizes} == pytest.approx(sizes), "an effect named alone is a set of one"
     named = blind_case_score_summary([marked("null", experiment=name) for name in "abb"])["experiments"]
     assert {name: own["cases"] for name, own in named.items()} == {"a": 1, "b": 2}
     none = blind_case_score_summary([])
-    assert (none["cases"], {none[name] for name in rates}) == (0, {None})
+    assert (none["cases"], {none[name] for name in sizes}) == (0, {None})
     assert all(entry["rate"] is None for entry in none["intervals"].values())
     assert none["confusion"]["counts"] == []
 
@@ -312,7 +310,7 @@ def diagnosed(decrease=180.0, there=0.5):
     known = {"screening": screening(ranked), "nominal_model": fit((), loss(3.0, 3.2), 100.0, {"k": 2.0})}
     record = EffectSearchRecord(refits, {f"beside {FRICTION.label}": beside}, {FRICTION.label: ()})
     named = {"single_effect_models": (refits[FRICTION.label],), "selected_effects": (added(FRICTION),)}
-    return finding(**named, record=record, located_gap=(place("elbow"),), **known)
+    return finding(**named, record=record, **known)
 
 
 def again(finding, **limits):
@@ -375,9 +373,10 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
         value = {"seconds": 9.0, "result": made.to_dict(), "evidence": blind_scores.diagnosis_evidence_to_dict(made)}
         (tmp_path / f"answers/{i}.json").write_text(json.dumps({"name": f"case_{i}", "value": value}))
     said = rescore_blind(tmp_path, tmp_path / "same").result
-    assert (said["not_judged"], said["rescored"]["changed"], said["detection"]["3"]["right"]) == (0, [], 1.0)
+    assert (said["not_judged"], said["rescored"]["changed"]) == (0, [])
+    assert said["detection_intervals"]["3"]["right"]["rate"] == 1.0
     said = rescore_blind(tmp_path, tmp_path / "other", ["diagnosis.significance_level=0.05"]).result
-    assert (said["cases"], said["not_judged"], said["detection"]["3"]["cases"]) == (2, 1, 1)
+    assert (said["cases"], said["not_judged"], said["detection_intervals"]["3"]["gap"]["of"]) == (2, 1, 1)
     assert said["confusion"]["said"] == ["joint_coulomb", "not_judged"]
     [changed] = said["rescored"]["changed"]
     known = {"case": "case_0", "then": "effect joint_coulomb@elbow", "now": "not_judged -"}
@@ -405,7 +404,7 @@ def test_slices_of_one_ensemble_count_together_and_can_be_judged_again(tmp_path,
     parts = [written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3)) / "slice.json"]
     joined = score_joined_slices(parts, tmp_path / "joined").result
     assert [entry["case"] for entry in joined["marks"]] == [f"case_{i:03d}" for i in range(4)]
-    assert (joined["slices"], joined["cases"], joined["false_alarms"]) == (["1/2", "2/2"], 4, 0.0)
+    assert (joined["slices"], joined["cases"], joined["intervals"]["false_alarms"]["rate"]) == (["1/2", "2/2"], 4, 0.0)
     assert rescore_blind(tmp_path / "joined", tmp_path / "again").result["cases"] == 4
 
 

@@ -264,8 +264,8 @@ def test_an_effect_is_accepted_if_its_size_is_known_beside_all_that_is_left(firs
     assert (said.verdict, said.unknown_reason) == (("effect", "") if known else ("unknown", "stand_in"))
     [entry] = said.transfer_checks
     assert (entry.effect, entry.parameter) == (SPRING, "spring@elbow.k")
-    assert (entry.estimation_value, entry.held_out_value) == (first[0], second[0])
-    assert (entry.estimation_std, entry.held_out_std) == pytest.approx((first[1], second[1]), nan_ok=True)
+    assert entry.fitted == first
+    assert entry.held_out == pytest.approx(second, nan_ok=True)
 
 
 def test_one_part_of_a_vector_that_agrees_is_enough():
@@ -342,7 +342,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
     [entry] = judgement([added(SPRING, fitted=first)], search=search).transfer_checks
-    assert (entry.estimation_value, entry.held_out_value) == (2.0, 7.0)
+    assert (entry.fitted[0], entry.held_out[0]) == (2.0, 7.0)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
     assert start == {"k": 3.0, "spring@elbow.k": 2.0, "spring@elbow.s": 0.5}, "no start of a single recording"

@@ -57,7 +57,7 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert told["single_effects"]["joint_coulomb@elbow"] == {"held_out_chi2_per_sample": left, "bic_difference": 0.0}
     assert min(entry["bic_difference"] for entry in told["single_effects"].values()) == 0.0, "no other is as likely"
     [apart] = finding.transfer_checks
-    assert abs(apart.estimation_value - apart.held_out_value) < 4 * np.hypot(apart.estimation_std, apart.held_out_std)
+    assert abs(apart.fitted[0] - apart.held_out[0]) < 4 * np.hypot(apart.fitted[1], apart.held_out[1])
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
     assert "\n  joint_coulomb@elbow: tau_c" in result["summary"]

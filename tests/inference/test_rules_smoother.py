@@ -401,9 +401,10 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = smoother.interval_edges_names_and_z_scores(found)
-    assert values.shape == (len(edges) - 1, len(names))
-    assert np.isfinite(values[:, names.index(name)]).any()
+    trace = found.smoothed_unknowns[0]
+    values = smoother.smoothed_unknown_z_scores(found, trace)
+    assert values.shape == (len(trace.interval_edges) - 1, len(trace.unknown_names))
+    assert np.isfinite(values[:, trace.unknown_names.index(name)]).any()
 
 
 def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):

@@ -217,7 +217,7 @@ def made(
     verdict = "effect" if gap else "no_gap"
     truth = "-" if category == "null" else "kelvin_voigt@T1"
     told = ("case_000", category, truth, verdict, answer, size)
-    return BlindCaseScore(*told, gap, gap, gap, gap, (), right, 0.9, 1.0, experiment=experiment, **more)
+    return BlindCaseScore(*told, gap, gap, gap, (), right, 0.9, 1.0, experiment=experiment, **more)
 
 
 MARKS = [

@@ -30,8 +30,8 @@ from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
 from yid_ocp.errors import DataError
 from yid_ocp.files import dataclass_from_plain_data, to_json_types, to_lossless_plain_data
+from yid_ocp.inference import smoother
 from yid_ocp.inference.null_test import NullTestResult
-from yid_ocp.inference.smoother import GapLocation, gap_locations_from_closures_and_smoother
 from yid_ocp.model.parameters import Parameter, Parameters
 
 _FORMAT = "yid-blind/1"
@@ -54,7 +54,6 @@ class BlindCaseScore:
     multiple: float  # true size over the detectable size; NaN if not applicable
     gap: bool  # whether a gap was reported
     kind_first: bool  # whether the first candidate has the true kind at the true location
-    kind_second: bool  # whether the true kind is among the first two candidates
     location_first: bool  # whether the first location of the gap is that of a true effect
     confusable: tuple[str, ...]  # effects that the diagnosis calls confusable with the first named one
     # whether the answer is right. Clean case: `no_gap`. Effect outside the library: `unknown` with the true location.
@@ -118,7 +117,6 @@ def score_blind_case(
         multiple=_or_nan(label.multiple),
         gap=verdict not in ("no_gap", "insufficient_data"),
         kind_first=bool(true) and listed[:1] == (true[0],),
-        kind_second=bool(true) and true[0] in listed[:2],
         location_first=located,
         confusable=next((group for group in groups if named and named[0] in group), ()),
         right=right,
@@ -171,7 +169,7 @@ def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
     every, marks = marks, [m for m in marks if m.verdict != _NOT_JUDGED]
     by = {sort: [m for m in marks if m.category == sort] for sort in _CATEGORIES}
-    singles, pairs = by["single"], by["pair"]
+    singles = by["single"]
     strange = [m for m in marks if m.category in _OUT_OF_LIBRARY_CATEGORIES]
     seen = [m for m in singles if m.gap]
     named = [m for m in seen if m.answer != "-"]
@@ -180,14 +178,11 @@ def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "false_alarms": [m.gap for m in by["null"]],
         "detected": [m.gap for m in singles],
         "kind_first": [m.kind_first for m in seen],
-        "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],
         "sets_cover": [m.truth in m._named_effect_labels for m in named],
-        "unknown_recall": [m.verdict == "unknown" for m in strange],
         **{f"unknown_{sort}": [m.verdict == "unknown" for m in by[sort]] for sort in _OUT_OF_LIBRARY_CATEGORIES},
         "unknown_location": [m.location_first for m in strange if m.gap],
-        "pairs_right": [m.right for m in pairs],
-        "pairs_named": [set(m.truth.split(" + ")) <= set(m.answer.split(" + ")) for m in pairs],
+        "pairs_right": [m.right for m in by["pair"]],
         "interval_coverage": [inside for _, inside in errors],
     }
     intervals = {name: _binomial_proportion(hits) for name, hits in shares.items()}
@@ -202,9 +197,7 @@ def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "format": _FORMAT,
         "cases": len(every),
         "not_judged": len(every) - len(marks),
-        **_rates(intervals),
         "intervals": intervals,
-        "detection": {size: {"cases": own["gap"]["of"], **_rates(own)} for size, own in detected.items()},
         "detection_intervals": detected,
         "set_size": mean([len(m._named_effect_labels) for m in named]),
         "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
@@ -215,10 +208,6 @@ def blind_case_score_summary(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "calibration": _calibration_rates(marks),
         "marks": [asdict(m) for m in every],
     }
-
-
-def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    return {name: entry["rate"] for name, entry in intervals.items()}
 
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
@@ -441,6 +430,8 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
     record, plain = result.record, to_lossless_plain_data
     pairs = {name: [[[e.label for e in both], fall] for both, _, fall in own] for name, own in record.pairs.items()}
     candidates = {entry.effect.label: entry.effect for entry in result.screening.detectability}
+    smoothed = result.smoother_result
+    located = () if smoothed is None else smoother.gap_locations_by_smoother_evidence(smoothed)
     return {
         "format": _EVIDENCE_FORMAT,
         "effects": {label: plain(effect.definitions) for label, effect in candidates.items()},
@@ -450,7 +441,7 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "has_left_baseline": result.has_left_baseline,
         "discretisation_chi2": result.discretisation_chi2,
         "thresholds": plain(result.thresholds),
-        "located_gap": {"locations": plain(result.located_gap)},
+        "located_gap": {"locations": plain(located)},
         "remaining": [plain(place) for place in result.remaining_gap_locations],
         "refits": {name: fit and _refit_to_json(fit) for name, fit in sorted(record.refits.items())},
         "screenings": {name: _screening_to_json(own) for name, own in record.screenings.items()},
@@ -493,8 +484,6 @@ class _RecordedCase:
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
         other = (data[name] for name in ("has_left_baseline", "discretisation_chi2"))
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *other)
-        located = data["located_gap"] or {"locations": ()}
-        self.located_gap = tuple(restored(GapLocation, place) for place in located["locations"])
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
             {name: self._screening(own) for name, own in data["screenings"].items()},
@@ -541,8 +530,9 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
         judged = judge(_RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record), case.evidence)
     except _UnrecordedRefitError:
         judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, (), 0.0)
-    where = case.located_gap
+    places = (data["located_gap"]["locations"], data["remaining"])
+    where, rest = (tuple(dataclass_from_plain_data(smoother.GapLocation, own) for own in part) for part in places)
     if judged.accepted_selected_effects:
-        rest = tuple(dataclass_from_plain_data(GapLocation, own) for own in data["remaining"])
-        where = gap_locations_from_closures_and_smoother(where, judged.accepted_effects_closure_by_location, rest, ())
+        closed = judged.accepted_effects_closure_by_location
+        where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, ())
     return judgement_to_dict(judged, case.evidence, where)

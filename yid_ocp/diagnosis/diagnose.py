@@ -350,14 +350,14 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         if seen is before:
             seen = _examined_anew(seen, judged)
     smoothed: SmoothedUnknownsResult | None = None
-    located = where = rest = tuple[GapLocation, ...]()
+    where = rest = tuple[GapLocation, ...]()
     screened = EMPTY_SCREENING_RESULT
     if judged.verdict not in ("no_gap", "insufficient_data"):
         search.progress.begin_stage("locating the gap in the model and its sensors", 3.0, 2.0)
         # without events, the smoother already ran on all fitted data
         least = limits.min_log_bayes_factor
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*nominal.at_estimates, least)
-        located = where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
+        where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
     remaining, events, is_counted = evidence.nominal_held_out_test, seen.events, False
     accepted = judged.accepted_selected_effects
@@ -400,7 +400,6 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         **(vars(evidence) | vars(judged)),
         noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
         record=search.record,
-        located_gap=located,
         smoother_result=smoothed,
         gap_locations=where,
         remaining_test=remaining,

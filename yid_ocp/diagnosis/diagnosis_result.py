@@ -47,7 +47,6 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     next_experiment: str = ""
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
-    located_gap: tuple[GapLocation, ...] = ()  # of the nominal model, by the smoother
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
     events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
     untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first

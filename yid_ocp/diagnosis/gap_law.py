@@ -51,8 +51,7 @@ class NonparametricLaw:
     visited_range: Mapping[str, tuple[float, float]]  # range of every quantity in the estimation recordings
     closure: null_test.HeldOutGapClosure  # closure of the held-out gap of the model without the law
     runner_up: tuple[str, str, float] | None  # location, quantities and closure of the second best law
-    model: RefittedModel  # the fitted model with the law
-    has_accepted_effects: bool  # whether the model also has accepted effects
+    model: RefittedModel  # the fitted model with the accepted effects and the law, which is the last effect
 
     @property
     def depends_on(self) -> str:
@@ -72,7 +71,7 @@ class NonparametricLaw:
             if len(torque):
                 ends = (f"{torque[i]:.2g} N m at {at[i]:.2g} {unit}" for i in (torque.argmin(), torque.argmax()))
                 sizes.append(f"from {' to '.join(ends)}")
-        gap = f"error beyond noise{' that the effects leave' * self.has_accepted_effects} on held-out motions"
+        gap = f"error beyond noise{' that the effects leave' * (len(self.model.effects) > 1)} on held-out motions"
         head = f"The error looks like a torque at {self.location} that depends on {words} ({', '.join(sizes)})."
         closed = f"It would remove {100 * self.closure.fraction:.3g} % of the {gap}. No accepted effect describes it."
         end = " It may come from outside the model, because no law of motion or load predicts it better." * is_over_time
@@ -159,7 +158,7 @@ def find_gap_law(
         names = best.law.knot_parameter_names(quantity)
         torque, std = (np.array([own[name] for name in names]) for own in (best.fit.values, best.fit.std))
         curves.append(TorqueLawTable(quantity, knots, torque, std))
-    return NonparametricLaw(best.law.location, tuple(curves), ranges, closure, runner_up, best.fit, bool(last.effects))
+    return NonparametricLaw(best.law.location, tuple(curves), ranges, closure, runner_up, best.fit)
 
 
 @dataclass(frozen=True)
@@ -274,7 +273,7 @@ def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
     """Return evidence, values and prior of one law, at the curvature weight and noise level of largest evidence."""
     n, gram, pull = len(residual), slopes.T @ slopes, slopes.T @ residual
     total = float(residual @ residual)
-    best: tuple[float, Array, Array] | None = None
+    families = []
     for weight in _ROUGHNESS_WEIGHTS:
         precision = _prior_precision(law, weight)
         matrix = gram + precision
@@ -282,10 +281,10 @@ def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
         left = max(total + float(pull @ values), 1e-12 * total, 1e-300)
         shrink = np.linalg.slogdet(precision)[1] - np.linalg.slogdet(matrix)[1]
         evidence = -0.5 * n * math.log(left / n) + 0.5 * float(shrink)
-        if best is None or evidence > best[0]:
-            best = (evidence, values, precision)
-    assert best is not None
-    return _Family(law, best[0], dict(zip(law.parameters.names, map(float, best[1]), strict=True)), best[2])
+        families.append(
+            _Family(law, evidence, dict(zip(law.parameters.names, values.tolist(), strict=True)), precision)
+        )
+    return max(families, key=lambda family: family.log_evidence)
 
 
 def _prior_precision(law: TorqueLaw, roughness_weight: float) -> Array:

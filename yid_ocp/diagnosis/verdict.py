@@ -25,24 +25,21 @@ class EffectAmplitudeTransferCheck:
 
     effect: EffectBase
     parameter: str  # with the label of the effect
-    estimation_value: float
-    estimation_std: float
-    held_out_value: float
-    held_out_std: float
+    fitted: tuple[float, float]  # value and standard deviation
+    held_out: tuple[float, float]
 
     @property
     def text(self) -> str:
         """A text with both estimates."""
         unit = f" {self.effect.parameters[self.parameter].unit}".removesuffix(" 1")
-        here = f"{self.estimation_value:.4g} ± {self.estimation_std:.2g}{unit} on the fitted recordings"
-        there = f"{self.held_out_value:.4g} ± {self.held_out_std:.2g}{unit} on the held-out ones"
-        return f"{self.parameter} is {here} and {there}"
+        here, there = (f"{value:.4g} ± {std:.2g}{unit}" for value, std in (self.fitted, self.held_out))
+        return f"{self.parameter} is {here} on the fitted recordings and {there} on the held-out ones"
 
     @property
     def significant_disagreement_as_std(self) -> float:
         """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
-        apart = abs(self.estimation_value - self.held_out_value)
-        spread = math.hypot(self.estimation_std, self.held_out_std)
+        (here, std), (there, other_std) = self.fitted, self.held_out
+        apart, spread = abs(here - there), math.hypot(std, other_std)
         return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
@@ -214,6 +211,6 @@ def _check_effect_amplitude_transfer(
     """
     if (again := search.refit_on_held_out(fit)) is None:
         return ()
-    names = [(effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names]
-    both = ((fit.values[name], fit.std[name], again.values[name], again.std[name]) for _, name in names)
-    return tuple(EffectAmplitudeTransferCheck(*of, *own) for of, own in zip(names, both, strict=True))
+    names = ((effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names)
+    both = ((of, ((own.values[of[1]], own.std[of[1]]) for own in (fit, again))) for of in names)
+    return tuple(EffectAmplitudeTransferCheck(*of, *estimates) for of, estimates in both)

@@ -411,8 +411,7 @@ def smooth_unknown_forces_and_biases(
         drop, alternatives = _alternatives(models, variance, nothing, state, least)
         traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
         # the variance of a group's scores is the mean rise of r'r by unknowns of the reference size
-        scores = {source: max(score, 1e-300) for source, (_, score) in nothing.scores.items()}
-        detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / score) for s, score in scores.items()}
+        detectable = {s: math.sqrt(_DETECTABLE_CHI2_RISE / max(v, 1e-300)) for s, (_, v) in nothing.scores.items()}
         explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
         return SmoothedUnknownsResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
 
@@ -574,20 +573,15 @@ def gap_locations_from_closures_and_smoother(
     return _by_share(found)
 
 
-def interval_edges_names_and_z_scores(
-    smoothed: SmoothedUnknownsResult, recording: int = 0
-) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the interval edges (J + 1,) [s], the names of nd smoothed unknowns, and their z scores (J, nd).
+def smoothed_unknown_z_scores(smoothed: SmoothedUnknownsResult, trace: SmoothedDisturbances) -> Array:
+    """Return the z scores (J, nd) of a recording: posterior mean over standard deviation of nd unknowns in J intervals.
 
-    A z score is the posterior mean over the standard deviation in an interval. It is NaN if the data reduced the
-    variance of the unknown by half or less. `recording` is the index of a recording.
+    A z score is NaN if the data reduced the variance of the unknown by half or less.
     """
-    trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
     with np.errstate(divide="ignore", invalid="ignore"):
         informed = (prior > 0) & (1 - trace.posterior_std**2 / prior > _INFORMED_FRACTION)
-        values = np.where(informed, trace.posterior_mean / trace.posterior_std, np.nan)
-    return trace.interval_edges, trace.unknown_names, values
+        return np.where(informed, trace.posterior_mean / trace.posterior_std, np.nan)
 
 
 def smoothed_unknown_units(system: System, trace: SmoothedDisturbances) -> tuple[str, ...]:

@@ -211,9 +211,8 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     ]
     marks = [("what", "value (cases, 95 % interval)", "good is"), *(row for row in measures if row[1] != "-")]
     seen: TableRows = [("size / detectable size", "cases", "gap reported", "true effect first", "true effect named")]
-    for size, entry in result["detection"].items():
-        own = result["detection_intervals"][size]
-        seen.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
+    for size, own in result["detection_intervals"].items():
+        seen.append((size, str(own["gap"]["of"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
     tried: TableRows = [("experiment", "cases", "not judged", "false alarms", "right answers")]
     for name, own in result["experiments"].items():
         counts = (str(own["cases"]), str(own.get("not_judged") or ""))
@@ -507,8 +506,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
     where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"
-    for group in dict.fromkeys(entry["channel"].rpartition(".")[0] for entry in judged):
-        alike = [entry for entry in judged if entry["channel"].rpartition(".")[0] == group]
+    for group, alike in grouped((entry["channel"].rpartition(".")[0], entry) for entry in judged).items():
         sizes = zip(*((*entry["rmse"].values(), entry["difference"]) for entry in alike), strict=True)
         means = [statistics.fmean(size**2 for size in own) ** 0.5 for own in sizes]
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]

@@ -58,7 +58,8 @@ _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an eq
 @register_summary("yid-solve/1")
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
-    failed, converged = result["status"] == "failed", result["status"] == "converged"
+    status = result["status"]
+    failed, converged = status == "failed", status == "converged"
     is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
@@ -106,10 +107,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
-    steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (
-        result["status"] == "iteration_limit"
-    )
-    ended = f"{result['status'].replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
+    steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
+    ended = f"{status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
     yield f"{ended}: {result['message']}" if converged else ended
 
@@ -153,17 +152,14 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 
     A group gets one if the model does not explain the fitted data, or its error is over twice that of noise.
     """
-    for group in dict.fromkeys(channel.rpartition(".")[0] for channel in result["residuals"]):
-        channels = [channel for channel in result["residuals"] if channel.rpartition(".")[0] == group]
-        unit = result["residuals"][channels[0]]["unit"]
-        fitted = _rms([result["residuals"][c]["rmse"] for c in channels])
+    residuals = result["residuals"]
+    for group, channels in grouped((channel.rpartition(".")[0], channel) for channel in residuals).items():
+        unit, fitted = residuals[channels[0]]["unit"], _rms([residuals[c]["rmse"] for c in channels])
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
-        if not entries:
-            continue
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
         known = [e["baselines"] for e in entries]
-        names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
+        names = [n for n in [*known, {}][0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
         guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))
@@ -252,9 +248,7 @@ def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
                 if entry[side] == 0:
-                    remedy = (
-                        "Fix {0} there (parameters.{0}.free: false) if it is absent. If not, look for another cause."
-                    )
+                    remedy = "Fix {0} there (parameters.{0}.free: false) if it is absent. If not, find another cause."
                 elif entry["verdict"] == "not_identifiable":
                     remedy = "Fix {0} at a known value, because these recordings do not determine it."
                 by_bound.setdefault((bound, remedy), []).append(name)

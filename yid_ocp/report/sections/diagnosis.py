@@ -12,7 +12,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
-from yid_ocp.inference.smoother import SmoothedUnknownsResult, interval_edges_names_and_z_scores, smoothed_unknown_units
+from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, smoothed_unknown_z_scores
 from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
@@ -120,7 +120,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
-    _, _, values = interval_edges_names_and_z_scores(smoothed, i)
+    values = smoothed_unknown_z_scores(smoothed, trace)
     units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
