@@ -123,8 +123,7 @@ def linearize_candidates(
         data, jacobian = residual_and_jacobian_with_stated_priors(trial, evaluation)
         del evaluation  # its Jacobian is large
         if point not in known:
-            names = amplitudes if point else trial.unknown_names
-            changed = (_changes(trial.with_episodes(own, ()), values, data, jacobian, names) for own in redrawn)
+            changed = (_changes(trial.with_episodes(own, ()), values, data, jacobian) for own in redrawn)
             known[point] = [(change * ~is_in_scatter, by_name) for change, by_name in filter(None, changed)]
         places = [trial.unknown_names.index(name) for name in amplitudes]
         if not point:
@@ -181,16 +180,15 @@ def _covariance_and_bias_of_score(
 
 
 def _changes(
-    again: EstimationProblem, values: Mapping[str, float], data: Array, jacobian: Array, names: Sequence[str]
+    again: EstimationProblem, values: Mapping[str, float], data: Array, jacobian: Array
 ) -> tuple[Array, dict[str, Array]] | None:
-    """Changes by redrawn noise of the data's residual `data` and, for each of `names`, of a column of its Jacobian."""
+    """Changes by redrawn noise of the data's residual `data` and, for each unknown, of a column of its Jacobian."""
     outcome, rows = again.evaluate(again.pack_unknowns(values)), again.residual_rows.data
     if not outcome.ok:
         return None
     other, slopes = residual_and_jacobian_with_stated_priors(again, outcome)
-    at = [again.unknown_names.index(name) for name in names]
-    changes = np.subtract(slopes[rows][:, at], jacobian[rows][:, at], dtype=np.float32)  # of many columns
-    return (other - data)[rows], dict(zip(names, changes.T, strict=True))
+    changes = np.subtract(slopes[rows], jacobian[rows], dtype=np.float32)  # of many columns
+    return (other - data)[rows], dict(zip(again.unknown_names, changes.T, strict=True))
 
 
 def _detectability(signature: _EffectSignature) -> CandidateDetectability:

@@ -100,8 +100,8 @@ def _lead(result: DiagnosisResult) -> str:
     moved = listed([shift.text for shift in result.rival_shifts])
     since = f"With {100 * result.rival_probability:.0f} % probability, no effect is missing, but parameters have "
     since += f"changed since the baseline: {moved}."
-    ordered = [probable, since] if result.probability > result.rival_probability else [since, probable]
-    probable = " ".join(ordered) if result.rival_shifts else probable
+    shares = sorted([(result.probability, probable), (result.rival_probability, since)], reverse=True)
+    probable = " ".join(text for share, text in shares if share)
     none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
