@@ -15,6 +15,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
+from yid_ocp.diagnosis.pulse_detection import ForceEstimate
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
@@ -61,11 +62,15 @@ def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
 def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_path):
     ((episode, outcome),) = solved_pendulum[2]
     other = SimpleNamespace(predicted_outputs=[2 * array for array in outcome.predicted_outputs])
-    finding = SimpleNamespace(smoother_result=None, events=NO_EVENTS)
+    t = np.arange(4.0)
+    whole = ForceEstimate("run", "arm", "elbow", "N m", t, 2 * t, np.diag(t + 1), t + 1, 0 * t)
+    spans = tuple(whole.subset_at_time_indices(np.array(part)) for part in ([0, 1, 2], [1, 2, 3]))
+    finding = SimpleNamespace(smoother_result=None, events=replace(NO_EVENTS, force_estimates=spans))
     prediction_outputs.write_diagnosis_hdf5(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
-        assert list(file) == ["held_out"]
+        assert list(file) == ["events", "held_out"]
+        np.testing.assert_allclose([file["events/run/elbow"][k] for k in ("t", "allowed")], [t, t + 1])
         group = file["held_out/joints.effort"]
         np.testing.assert_array_equal(group["before"], outcome.predicted_outputs[0])
         np.testing.assert_array_equal(group["after"], 2 * outcome.predicted_outputs[0])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
+from yid_ocp.display import grouped
 from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.inference.uncertainty import ParameterEstimate
@@ -212,10 +213,14 @@ def write_diagnosis_hdf5(
             relative = {"mean": trace.posterior_mean, "std": trace.posterior_std, "prior": np.sqrt(variance)}
             absolute = {name: array * trace.reference_std for name, array in relative.items()}
             _store(group, {"edges": trace.interval_edges, **absolute})
-        for force in result.events.force_estimates:
-            group = file.create_group(f"events/{force.recording}/{force.coordinate}")
-            group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.most_likely_force_signal, "allowed": force.assumed_model_error})
+        found = ((f"events/{force.recording}/{force.coordinate}", force) for force in result.events.force_estimates)
+        for name, parts in grouped(found).items():  # parts of a long recording overlap
+            group = file.create_group(name)
+            group.attrs["unit"] = parts[0].unit
+            t, first = np.unique(np.concatenate([part.t for part in parts]), return_index=True)
+            value = np.concatenate([part.most_likely_force_signal for part in parts])[first]
+            allowed = np.concatenate([part.assumed_model_error for part in parts])[first]
+            _store(group, {"t": t, "value": value, "allowed": allowed})
 
 
 def _store_sensor(
