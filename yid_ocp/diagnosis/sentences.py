@@ -13,9 +13,8 @@ from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.display import texts_that_hold as _said
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference import null_test
+from yid_ocp.inference import null_test, uncertainty
 from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
-from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
@@ -111,7 +110,7 @@ def _lead(result: DiagnosisResult) -> str:
     not_yet = f"Do not use the estimates yet, because {why}."
     return {
         "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
-        "no_gap": none,
+        "no_gap": none + uncertainty.overstated_noise_sentence(*max((t.chi2_per_dof, t.p_value) for t in tests)),
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
         "effect": f"Use the model with {names}, not the nominal one{beyond}. {probable} {gap}",
@@ -258,7 +257,10 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         at, own = fit.problem.residual_rows, fit.effects[-1]
         data, priors = (fit.evaluation.jacobian[part] for part in (at.data, at.stated_priors))
         names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
-        by = [mask_of_priors_determining_unknown(data, priors, names.index(n)) for n in own.amplitude_parameter_names]
+        by = [
+            uncertainty.mask_of_priors_determining_unknown(data, priors, names.index(n))
+            for n in own.amplitude_parameter_names
+        ]
         others = [*dict.fromkeys(names[i] for mask in by for i in np.flatnonzero(mask[:shared]))]
         pairs += _said((others, f"{own.label} from {listed(others)}"))
     return _said((pairs, f"These recordings cannot separate {'; '.join(pairs)}. {remedy}"))
@@ -268,7 +270,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
     values = []
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
-        known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
+        known = f"{uncertainty.value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
     ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:]]
     far, so = " (far outside its expected range", "so possibly a substitute for another cause)"

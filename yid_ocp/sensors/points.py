@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, require_known_names, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
@@ -55,6 +55,11 @@ def _points(
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
     for point in wanted:
+        if point not in group.names:
+            near = nearest_name_question(point, [name for name in group.names if name not in wanted])
+            hint = near or f"record or simulate it too, or remove it from sensors.{group.name}.used_points"
+            what, listed = f"the recording has no point '{point}'", ", ".join(group.names)
+            raise DataError(what, where=where, allowed=listed, hint=hint)
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
             what = f"the point '{point}' belongs to the frame '{frames[point]}', which the model does not have"
@@ -69,7 +74,6 @@ def _points(
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
-    require_known_names(known, group.names, "point", where, DataError)
     columns = [group.names.index(point) for point in known]
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))

@@ -288,7 +288,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if not has_object and not is_servo and joints.effort is None and not wrists:
         what = "the recording has no measurement of the forces that move the arm"
         allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
-        hint = "import efforts too (`yid-ocp import FILE --preview` lists signals), or add --object and its dimensions"
+        hint = "import efforts too (`yid-ocp import FILE --preview` lists signals); with --object, import points on it"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
         hint = "import points too; `yid-ocp import FILE --preview` lists the signals of a file"
@@ -310,11 +310,11 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
     """Name of a joint or point that moves just after a time, from a line fit; empty if nothing moves."""
-    seen = [("point {}", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
+    seen = [("point '{}'", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
     group = recording.joints
     if group is not None:
         values = group.position[:, [group.names.index(name) for name in joints]]
-        seen.insert(0, ("joint {}", tuple(joints), group.t, values, _JOINT_REST_SPEED))
+        seen.insert(0, ("joint '{}'", tuple(joints), group.t, values, _JOINT_REST_SPEED))
     for words, names, t, values, rest_speed in seen:
         speeds, noise = _speeds(t, values, time)
         fast = speeds > rest_speed + 4 * noise
