@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_origin
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
@@ -183,8 +183,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
-        what = f"the value '{value_text[:80]}' is not valid YAML"
-        hint = "put a space after each colon, close brackets, and quote the value whole"
+        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "put a space after colons, and close brackets"
         raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from error
     parent = data
     for i, part in enumerate(path[:-1]):
@@ -313,14 +312,8 @@ class _Reader:
                 advice += f", converted from {match[2].strip()}"
         if isinstance(raw, dict) and options.variadic_tuple_entry_type(hint) is not None:
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
-        named = schema.section_variants_from_annotation(options.mapping_value_type(hint))
-        if isinstance(raw, list) and named is not None:
-            advice = (
-                f"{nearest_name_question(str(raw[:1]), named.classes)} Write {{NAME: {{}}}} in place of a list".strip()
-            )
         if isinstance(raw, str) and not re.match(r"[-+.\d\s]", raw) and (choices := options.literal_choices(hint)):
-            if get_origin(options.split_annotated(hint)[0]) is Literal:  # the description explains the values
-                advice = f"choose an allowed value ({schema.option_info_from_annotation(hint).description})"
+            advice = f"choose an allowed value ({schema.option_info_from_annotation(hint).description})"
             advice = nearest_name_question(raw, choices) or advice
         shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and not {*",'"} & {*unit} else _shown(raw)
         what = f"{self._name(path)} is {shown}, which is not allowed"

@@ -15,6 +15,7 @@ from yid_ocp.display import texts_that_hold as _said
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test, uncertainty
 from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
+from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
@@ -257,10 +258,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
         at, own = fit.problem.residual_rows, fit.effects[-1]
         data, priors = (fit.evaluation.jacobian[part] for part in (at.data, at.stated_priors))
         names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
-        by = [
-            uncertainty.mask_of_priors_determining_unknown(data, priors, names.index(n))
-            for n in own.amplitude_parameter_names
-        ]
+        by = [mask_of_priors_determining_unknown(data, priors, names.index(n)) for n in own.amplitude_parameter_names]
         others = [*dict.fromkeys(names[i] for mask in by for i in np.flatnonzero(mask[:shared]))]
         pairs += _said((others, f"{own.label} from {listed(others)}"))
     return _said((pairs, f"These recordings cannot separate {'; '.join(pairs)}. {remedy}"))
@@ -270,7 +268,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
     values = []
     for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
-        known = f"{uncertainty.value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
+        known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
         values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
     ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:]]
     far, so = " (far outside its expected range", "so possibly a substitute for another cause)"

@@ -460,7 +460,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     yield f"Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
-    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (all: median)")]
+    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "typical noise std")]
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"

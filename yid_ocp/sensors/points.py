@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, nearest_name_question, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
@@ -54,12 +54,10 @@ def _points(
     frames = {p: choice.frame_by_recorded_name.get(p, p) for p in wanted}
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
+    if lost := [point for point in wanted if point not in group.names]:
+        what, hint = f"the recording has no point '{lost[0]}'", "record or simulate it too, or correct used_points"
+        raise DataError(what, where=where, allowed=", ".join(group.names), hint=hint)
     for point in wanted:
-        if point not in group.names:
-            near = nearest_name_question(point, [name for name in group.names if name not in wanted])
-            hint = near or f"record or simulate it too, or remove it from sensors.{group.name}.used_points"
-            what, listed = f"the recording has no point '{point}'", ", ".join(group.names)
-            raise DataError(what, where=where, allowed=listed, hint=hint)
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
             what = f"the point '{point}' belongs to the frame '{frames[point]}', which the model does not have"

@@ -127,17 +127,9 @@ def propose_config_choices(
 
     Raises `ConfigError` if no recorded joint is in the URDF, a later recording lacks a joint of the first, or a frame
     does not exist; other errors are as in `read_urdf`.
-
-    Parameters
-    ----------
-    branches : sequence of FlexibleSegment
-        Segments of the object, parents first. Empty for an arm without an object.
-    holder : str, optional
-        Frame that carries the object's root. Default: the tool of the arm that moves most.
-    grasps : mapping of frame to point, optional
-        Other grasps. Default: ends of the object, if it stands on the ground or two arms were recorded.
-    standing : bool
-        Whether the object stands on the ground and arms hold its ends.
+    `branches` are the object's segments, parents first; none for an arm without an object. `holder` is the frame that
+    carries its root (default: the tool of the arm that moves most). `grasps` are points of the object by frame
+    (default: its ends, if two arms were recorded or it is `standing` on the ground, where arms hold its ends).
     """
     whole, first = read_urdf(robot), recordings[0]
     recorded, known = first.joints, _recorded_urdf_joints(robot, whole, recordings)

@@ -404,10 +404,8 @@ def _meanings(
             channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
             allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z, <link>_force_x, and so on, with a "
             allowed += "unit such as [ms], [deg], [N m], or without"
-            hint = (
-                f"rename the column, give its meaning (--columns '{name}=position:JOINT'; for a current, effort:JOINT "
-            )
-            hint += f"and --torque-constants), or leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
+            hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT', of a current effort:JOINT "
+            hint += f"with --torque-constants), or leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
