@@ -152,10 +152,10 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 def default_value_hint(key: str, option: Option) -> str:
     """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
-    default, allowed = option.default_value, describe_type(option.type_hint)
+    default, said = option.default_value, f"set {key} to an allowed value"
     if isinstance(default, (int, float, str)) or (default and isinstance(default, tuple)):
-        return f"set {key} to an allowed value, such as {[*default] if isinstance(default, tuple) else default}"
-    return f"write {key} as {allowed}" + ", or leave it out" * (default is not MISSING)
+        return f"{said}, such as {[*default] if isinstance(default, tuple) else default}"
+    return said + ", or leave it out" * (default is not MISSING)
 
 
 def _within(hint: Any, value: Any) -> bool:

@@ -232,7 +232,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"goal": "path"}, ("no waypoints",)),
         ({"goal": "box"}, ("plan.goal is box, but plan.box is not set",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
-        ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.frames_in_box")),
+        ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, (" m outside the box along z", "plan.frames_in_box")),
         ({"minimize_parameter_sensitivity": True}, ("parameters is not known", "plan.parameter_run_folder")),
         ({"n_spline_coefficients": 1}, ("n_spline_coefficients is 1", "from 2")),
         ({"duration": -1.0}, ("duration is -1", "above 0")),

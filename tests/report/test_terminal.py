@@ -177,14 +177,14 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
-    said = "With twice the links, these estimates would change by more than their ± without this error: p.a by"
-    rest = "With half the time step, no estimate would change by more than its ± without this error."
+    said = "With twice the links, these estimates would change by more than their ± from the data: p.a by -5.5"
+    rest = "With half the time step, no estimate would change by more than its ± from the data."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "To reduce these errors, set model.object.links: 8, and solve again."
-    assert lines[at + 1 : at + 4] == ["-5.5 (± 0.073). The ± of the table includes this.", rest, cure]
+    assert lines[at + 1 : at + 4] == ["(± 0.073). The ± of the table includes this.", rest, cure]
     noisy = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
     ends = [" ".join(told("yid-solve/1", solved(discretisation=noisy, status=s))) for s in ("converged", "stalled")]
-    assert [("or encoder noise (sensors.joints." in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]
+    assert [("or with the noise of joint" in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]
 
 
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():

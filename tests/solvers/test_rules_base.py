@@ -626,7 +626,7 @@ def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
     found = fit_problem(problem, GaussNewton(max_iterations=100), initial_unknowns=[0.0, 0.0], restarts=False)
     assert found.status == Status.CONVERGED
     assert found.n_iterations == 20
-    assert "moved no unknown by more than a tenth of its standard deviation" in found.message
+    assert "moved no estimated value by more than a tenth of its standard deviation" in found.message
 
 
 @pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])

@@ -74,7 +74,7 @@ def test_what_the_preview_proposes_imports_the_file(odd, printed):
 def test_left_out_lines_are_told(odd, printed):
     (odd / "bad.csv").write_text("t,q_a\n0,0\n1,x\n2,0\n")
     told = printed("import", "bad.csv", "--out", "bad.h5", "--skip-bad-lines")
-    assert "note: 1 of 3 lines were left out, because they are not rows of numbers (line 3)" in told
+    assert "note: left out 1 of 3 lines, because they are not rows of numbers (line 3)" in told
 
 
 BOTH = ("joints.csv", "mocap.csv")

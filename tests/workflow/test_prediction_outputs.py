@@ -182,7 +182,7 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     assert (effort["bias_std"], position["std"]) == (OFFSET, ANGLE)
     words = _noise_words(noise, "joints")
     assert ("(estimated)" in words) is estimated
-    assert (", offset ± 0.2 N m" in words, words.endswith("; 0.0001 rad")) == (True, True)
+    assert ("(unknown offset: ± 0.2 N m)" in words, words.endswith("; position 0.0001 rad")) == (True, True)
     calm = problem_with_exact_inputs(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}
 

@@ -73,7 +73,7 @@ def _read(path: Path) -> str:
         what, hint = error.what, error.hint
         if isinstance(error.__cause__, FileNotFoundError):
             what = "there is no such configuration file"
-            hint = nearest_file_question(path, "*.yaml") or hint
+            hint = nearest_file_question(path, "*.y*ml") or hint
         raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
 
 
@@ -183,7 +183,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
-        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "close brackets, and quote the value whole"
+        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "put a space after colons, and close brackets"
         raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from error
     parent = data
     for i, part in enumerate(path[:-1]):

@@ -77,8 +77,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     """Make the error for an unknown key `name`. It suggests the nearest `known` key, and sections that have the key."""
     known = list(known)
     homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
-    hints = [near] if near else []
-    hints += [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else []
+    hints = [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else [near] if near else []
     # a key of an older version often resembles a present one that means something else
     hints = [*(hints or [f"leave '{name}' out"]), RENAMED_NAMES_HINT]
     if name.partition(".")[0] in known and "." in name:
@@ -87,7 +86,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
         hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")
     allowed = unknown_name_error_arguments(name, known)["allowed"]
-    return ConfigError(what, where=where, allowed=allowed, hint="; ".join(hints))
+    return ConfigError(what, where=where, allowed=allowed, hint="; ".join(hints).replace("?;", "?"))
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:

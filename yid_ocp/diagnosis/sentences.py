@@ -13,7 +13,7 @@ from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.display import texts_that_hold as _said
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference import null_test
+from yid_ocp.inference import null_test, uncertainty
 from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
@@ -109,7 +109,7 @@ def _lead(result: DiagnosisResult) -> str:
     not_yet = f"Do not use the estimates yet, because {why}."
     return {
         "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
-        "no_gap": none,
+        "no_gap": none + uncertainty.overstated_noise_sentence(*max((t.chi2_per_dof, t.p_value) for t in tests)),
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
         "effect": f"Use the model with {names}, not the nominal one{beyond}. {probable} {gap}",

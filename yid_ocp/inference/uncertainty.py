@@ -489,9 +489,16 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
         said = "It is not certain whether the model explains the recordings, because noise may cause the error"
         return f"{said} ({size}{chance}). More data can decide this."
     if explains:
-        return f"The model explains the recordings to within their noise ({size})."
+        too_large = overstated_noise_sentence(chi2_per_dof, p_value)
+        return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
     return f"{said} To find the cause, check the stated noise and run `yid-ocp diagnose`."
+
+
+def overstated_noise_sentence(chi2_per_dof: float, p_value: float | None) -> str:
+    """Return a sentence, after a space, if the error of many samples is far below the stated noise; else nothing."""
+    said = f" The stated noise is about {chi2_per_dof**-0.5:.2g} times too large, so every ± is too large."
+    return said if chi2_per_dof < 0.25 and p_value is not None and p_value > 0.9999 else ""
 
 
 def value_and_uncertainty_text(
@@ -522,7 +529,7 @@ def finite_or_none(value: float) -> float | None:
 
 def percent_number_text(part: float) -> str:
     """Format a fraction as a percentage with two digits. There are no exponents below 10000 %."""
-    return f"{100 * part:.0f}" if 100 * part >= 99.5 and part < 100 else f"{100 * part:.2g}"
+    return f"{100 * part:.0f}" if 100 * part >= 99.5 and part < 100 else f"{100 * part * (abs(part) > 1e-9):.2g}"
 
 
 def interval_text(lower: float | None, upper: float | None) -> str:

@@ -163,8 +163,8 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
             row = int(np.argmax(over))
-            what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}, at {where[row]:.4g} m"
-            hint = "enlarge the box, or list the frames to keep in it under plan.frames_in_box"
+            what = f"'{name}' {when} {over[row]:.3g} m outside the box along {'xyz'[row]}, at {where[row]:.4g} m"
+            hint = "move this position, enlarge the box, or list only other frames under plan.frames_in_box"
             raise ConfigError(what, where="plan.box", allowed=f"{low[row]:.4g} to {high[row]:.4g} m", hint=hint)
 
 

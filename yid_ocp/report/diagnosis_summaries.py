@@ -395,7 +395,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "held-out error", "± std error", f"difference from {best}", "± of it", "unit", "note")]
+    rows: TableRows = [("law", "held-out error", "± std error", f"minus that of {best}", "± of this", "unit", "note")]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")

@@ -265,7 +265,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± with initial state (and any grasps) estimated too", "± with all else known")
+    unsure = ("± [of the value]", "± with initial state and grasps unknown too", "± with all else known")
     is_initial = result["at"] == "initial"
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
     for name, entry in parameters.items():
@@ -292,7 +292,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield "The ± leave out the error of simulation (time step, number of links), which `solve` adds." * (not is_initial)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
     doubtful = "the model does not explain the recordings" if is_poor else "a recording has a severe issue"
-    meanings = {"∞": "the recordings set no limit", "open": "any value is possible", "–": "no value is determined"}
+    meanings = {"∞": "no upper limit is known", "open": "any value is possible", "–": "no value is determined"}
     meanings["in doubt"] = f"{doubtful}, so the value may be wrong even if its ± is small"
     yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
@@ -318,8 +318,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         if asked["smallest"]:
             said = f"Record again with the fewest changes that determine all: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
-        rows = [("change", "parameters found", "gain [nat]")]
-        yield "Gain: information on all parameters. 0.7 nat more halves the standard deviation of one parameter."
+        rows = [("change", "parameters found", "information [nat]")]
+        yield "Information: of the recordings on all parameters. 0.7 nat more halves the ± of one parameter."
         changes = {own["words"]: own for own in (asked["base"], *asked["smallest"], *asked["singles"])}
         for entry in changes.values():
             gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
@@ -374,7 +374,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shares = ("" if own[key] is None else f"{percent_number_text(own[key])} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    steps = {"plan with the run RUN of solve (path from the configuration)": "plan --set plan.parameter_run_folder=RUN"}
+    steps = {"plan with the estimates of a `solve` (RUN: its folder)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
@@ -454,7 +454,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     yield f"Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
-    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise std (median)")]
+    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "typical noise std")]
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"
@@ -485,7 +485,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     step += ", after the advice above is followed" * is_advised
-    yield next_steps_table(result, {step: "solve"} if result["recordings"] else {})
+    yield next_steps_table(result, {step: "solve"} if result["recordings"] and not severe else {})
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
@@ -496,8 +496,8 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
         if known is not None and known["std"] is not None:
             words = " ".join(value_text_and_display_unit(known["std"], known["unit"]))
             offset = " ".join(value_text_and_display_unit(known.get("bias_std"), known["unit"]))
-            words += f", offset ± {offset}" if known.get("bias_std") else ""
-            said.append(words + (" (estimated)" if known.get("estimated") else ""))
+            words += f" (unknown offset: ± {offset})" if known.get("bias_std") else ""
+            said.append(f"{part[1:]} {words}".strip() + (" (estimated)" if known.get("estimated") else ""))
     return "; ".join(said)
 
 
@@ -522,11 +522,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
     seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    within = f"; of one reading: within {seconds:.2g} s of equilibrium" if seconds else ""
-    text = "The table has how far a change of each parameter (10 %, or one unit if zero) changes the readings, in "
-    text += "standard deviations of their noise (of all readings: root of the sum of squares, and noise does not hide "
-    text += f"{_MIN_VISIBLE_CHANGE} or more{within}). Equations: those of a time step that contain the parameter (del: "
-    yield f"{text}motion of a coordinate, p1: its momentum after the step). Observed: those that change a reading."
+    one = f" One reading: the largest change of a single reading within {seconds:.2g} s from equilibrium."
+    text = "All readings: how much all readings together change with the parameter (by its `change`), in standard "
+    yield f"{text}deviations of their noise ({_MIN_VISIBLE_CHANGE} or more is visible).{one * (seconds > 0)}"
+    text = "Equations: those of a time step that contain the parameter (del: motion of a coordinate, p1: its momentum "
+    yield f"{text}after the step). Observed: those of them that change a reading."
     yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
     if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
         yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."

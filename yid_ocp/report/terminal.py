@@ -202,7 +202,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
     estimates = {name: f"estimate: {own['value']:.4g} " for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
-    kinds["encoder_noise"] = "encoder noise (sensors.joints.position.std) added once more"
+    kinds["encoder_noise"] = "the noise of joint angles (sensors.joints.position.std) added a second time"
     quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
     found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
@@ -211,13 +211,13 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         worst = sorted(moved.items(), key=lambda item: -abs(item[1][key]) / item[1]["std"])
         changes = [f"{n} by {e[key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {e['std']:.2g})" for n, e in worst]
         if moved:
-            text = f"With {words}, these estimates would change by more than their ± without this error: "
+            text = f"With {words}, these estimates would change by more than their ± from the data: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The ± of the table includes this.")
         elif tried:
             quiet.append(words)
     if quiet:
-        said.append(f"With {' or '.join(quiet)}, no estimate would change by more than its ± without this error.")
+        said.append(f"With {', or with '.join(quiet)}, no estimate would change by more than its ± from the data.")
     return said + ([f"To reduce these errors, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, require_known_names, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
@@ -54,6 +54,9 @@ def _points(
     frames = {p: choice.frame_by_recorded_name.get(p, p) for p in wanted}
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
+    if lost := [point for point in wanted if point not in group.names]:
+        what, hint = f"the recording has no point '{lost[0]}'", "record or simulate it too, or correct used_points"
+        raise DataError(what, where=where, allowed=", ".join(group.names), hint=hint)
     for point in wanted:
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):
@@ -69,7 +72,6 @@ def _points(
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
-    require_known_names(known, group.names, "point", where, DataError)
     columns = [group.names.index(point) for point in known]
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))

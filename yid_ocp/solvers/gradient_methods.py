@@ -101,8 +101,8 @@ class GaussNewton(base.SolverWithCheckedSettings):
                 patience = _PATIENCE_STEPS[self.step_tolerance >= _COARSE_STEP_TOLERANCE]
                 saved = _saved(problem, recorder.history, now, patience)
                 if saved is not None:
-                    last = f"the last {patience} steps together lowered the cost by only {saved:.2g}"
-                    message = f"{last}, and moved no unknown by more than a tenth of its standard deviation"
+                    last = f"the last {patience} steps together lowered the cost by only {saved:.2g} (one std: 0.5)"
+                    message = f"{last}, and moved no estimated value by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
                 message = f"the search reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 50)}"

@@ -127,17 +127,9 @@ def propose_config_choices(
 
     Raises `ConfigError` if no recorded joint is in the URDF, a later recording lacks a joint of the first, or a frame
     does not exist; other errors are as in `read_urdf`.
-
-    Parameters
-    ----------
-    branches : sequence of FlexibleSegment
-        Segments of the object, parents first. Empty for an arm without an object.
-    holder : str, optional
-        Frame that carries the object's root. Default: the tool of the arm that moves most.
-    grasps : mapping of frame to point, optional
-        Other grasps. Default: ends of the object, if it stands on the ground or two arms were recorded.
-    standing : bool
-        Whether the object stands on the ground and arms hold its ends.
+    `branches` are the object's segments, parents first; none for an arm without an object. `holder` is the frame that
+    carries its root (default: the tool of the arm that moves most). `grasps` are points of the object by frame
+    (default: its ends, if two arms were recorded or it is `standing` on the ground, where arms hold its ends).
     """
     whole, first = read_urdf(robot), recordings[0]
     recorded, known = first.joints, _recorded_urdf_joints(robot, whole, recordings)
@@ -288,7 +280,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
     if not has_object and not is_servo and joints.effort is None and not wrists:
         what = "the recording has no measurement of the forces that move the arm"
         allowed = "efforts of its joints, commanded positions that differ from the measured ones, or a wrist sensor"
-        hint = "import efforts too (`yid-ocp import FILE --preview` lists signals), or add --object and its dimensions"
+        hint = "import efforts too (`yid-ocp import FILE --preview` lists signals); with --object, import points on it"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
         hint = "import points too; `yid-ocp import FILE --preview` lists the signals of a file"
@@ -310,11 +302,11 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:
     """Name of a joint or point that moves just after a time, from a line fit; empty if nothing moves."""
-    seen = [("point {}", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
+    seen = [("point '{}'", p.names, p.t, p.position.reshape(len(p.t), -1), _POINT_REST_SPEED) for p in recording.points]
     group = recording.joints
     if group is not None:
         values = group.position[:, [group.names.index(name) for name in joints]]
-        seen.insert(0, ("joint {}", tuple(joints), group.t, values, _JOINT_REST_SPEED))
+        seen.insert(0, ("joint '{}'", tuple(joints), group.t, values, _JOINT_REST_SPEED))
     for words, names, t, values, rest_speed in seen:
         speeds, noise = _speeds(t, values, time)
         fast = speeds > rest_speed + 4 * noise

@@ -155,7 +155,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
     if form not in _MODEL_FORMATS:
         why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")
         allowed, where = ", ".join((*_MODEL_FORMATS, _MCAP)), "--format, or the ending of --out"
-        what, hint = f"a run folder has no format '{form}'", f"write --format mjcf or mcap{why}"
+        what, hint = f"a run cannot be exported as '{form}'", f"write --format mjcf (model) or mcap (signals){why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if out.is_file():
         what, hint = f"{out.name} already exists", "choose another --out, or rename the file"

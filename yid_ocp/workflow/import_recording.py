@@ -129,7 +129,7 @@ def recording_issue_lines(recording: Recording) -> list[str]:
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     said = [f"issue ({issue.certainty_word}): {issue.what}\n  try: {issue.advice}" for issue in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        said.append(f"issue (likely): {reason}\n  try: import again with --units {quantity}={unit}")
+        said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit} --replace")
     return ["", *said] if said else []
 
 

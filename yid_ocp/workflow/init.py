@@ -71,8 +71,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
     result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    lines = _summary_lines(proposal, out, recordings, result["picture"] is not None)
-    lines += [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
+    lines = [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
+    lines += _summary_lines(proposal, out, recordings, result["picture"] is not None)
     end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
     print_result(arguments, result, lambda: lines, end, str(out))
     return EXIT_DONE
@@ -190,10 +190,10 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "the object" if proposal.has_object else "an unknown payload, which is estimated (no --object is given)"
+    carried = "object" if proposal.has_object else "payload, which is estimated (as no --object is given)"
     lines = [
         f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"frame that holds {carried}: {', '.join(held)}"
+        f"frame that holds the {carried}: {', '.join(held)}"
         + f" (other frames for --holder: {', '.join(others)})" * bool(others),
         f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
         f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",

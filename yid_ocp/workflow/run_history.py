@@ -113,7 +113,7 @@ def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve
 def read_result_file(file: Path) -> dict[str, Any]:
     """Read the result.json of any command. Raises `DataError` if it cannot be read or has an old format."""
     if not is_file(file):
-        hint = "give the run folder that `solve` or `diagnose` printed (in a setting: relative to the configuration)"
+        hint = "give the run folder that `solve` or `diagnose` printed"
         what = f"{file.parent} {'has no finished run' if file.parent.is_dir() else 'is not an existing folder'}"
         raise DataError(what, where=str(file), allowed="a run folder with result.json", hint=hint)
     result = read_input_json(file)

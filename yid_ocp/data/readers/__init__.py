@@ -79,6 +79,6 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        what, hint = f"there is no reader for '{key}' files", "export the data as CSV with the columns t, q_JOINT, ..."
-        raise DataError(what, where=str(path), **unknown_name_error_arguments(key, READERS, hint))
+        what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ... (robots: `init`)"
+        raise DataError(what, where=str(path), **unknown_name_error_arguments(key.replace(".urdf", ""), READERS, hint))
     return key

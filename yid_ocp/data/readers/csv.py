@@ -214,7 +214,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         units, why = base.guess_non_si_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
-    notes += [f"the header states that {quantity} is in {unit}" for quantity, unit in stated]
+    notes += [f"the header states {quantity} in {unit}" for quantity, unit in stated]
     guessed = [own for own in zip(units.items(), why, strict=True) if own[0][0] not in dict(stated)]
     if guessed:
         options["units"] = dict(own for own, _ in guessed)
@@ -309,7 +309,7 @@ def _read_table(
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        said = f"{len(bad)} of {n_lines} lines were left out, because they are not rows of numbers (line {listed})"
+        said = f"left out {len(bad)} of {n_lines} lines, because they are not rows of numbers (line {listed})"
         notes = (f"{said}. Of the first, {next(iter(bad.values()))}. The recording has no samples at their times",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
@@ -404,8 +404,8 @@ def _meanings(
             channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
             allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z, <link>_force_x, and so on, with a "
             allowed += "unit such as [ms], [deg], [N m], or without"
-            hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT'), or leave it out "
-            hint += f"(--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
+            hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT', of a current effort:JOINT "
+            hint += f"with --torque-constants), or leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
@@ -414,7 +414,7 @@ def _meanings(
         meanings[name] = own
     if ("t", "") not in meant:
         what = f"the table has no column of times; its columns are {', '.join(header)}"
-        hint = f"name the column of times, for example --columns '{next(filter(None, header))}=t'"
+        hint = "name the column of times, as in --columns 'COLUMN=t', or add times to the file"
         raise DataError(what, where=where, allowed="a column named t or time, in seconds", hint=hint)
     return list(meanings.values()), units
 
