@@ -374,7 +374,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shares = ("" if own[key] is None else f"{percent_number_text(own[key])} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    steps = {"plan with the estimates of a `solve` (RUN: its folder)": "plan --set plan.parameter_run_folder=RUN"}
+    steps = {"plan with the estimates of solve (RUN: its folder)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:

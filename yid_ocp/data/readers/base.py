@@ -74,7 +74,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
         of = next((si for si, known in _TO_SI.items() if _spaceless(unit) in map(_spaceless, known)), None)
         if of is None:
             every = dict.fromkeys(chain(*_TO_SI.values()))  # metres are units of two quantities
-            said = unknown_name_error_arguments(word.replace("grad", "deg"), every, "write for example --units deg,mm")
+            said = unknown_name_error_arguments(word, every, "write for example --units deg,mm")
             raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
         own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or unit not in MOTOR_CURRENT_UNITS)]
         for quantity in own:
