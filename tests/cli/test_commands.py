@@ -163,7 +163,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "what": "there is no key 'iteration'",
         "where": "--set solver.iteration",
         "allowed": "name, max_iterations, step_tolerance, cost_tolerance, initial_damping",
-        "hint": "did you mean 'max_iterations'?; CHANGELOG.md of the project has the new names of older ones",
+        "hint": "did you mean 'max_iterations'? CHANGELOG.md of the project has the new names of older ones",
         "exit_code": 2,
     }
     assert "did you mean 'max_iterations'?" in wrong.err

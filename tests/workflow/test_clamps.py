@@ -73,7 +73,7 @@ def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries
     ("overrides", "recording", "kind", "words"),
     [
         ((), blank(None), DataError, "has no marker positions"),
-        ((), blank(name="elsewhere"), ConfigError, "the frame mark takes its position"),
+        ((), blank(name="elsewhere"), ConfigError, "lacks the point 'mark', where the frame of this name is placed"),
         (("model.frames.mark.parent_frame=w_bean",), None, ConfigError, "its parent is not a frame of the object"),
         (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
         (("model.frames.foot={}", "model.object.mount.parent_frame=foot"), None, ConfigError, "moves"),

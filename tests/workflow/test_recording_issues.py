@@ -92,7 +92,7 @@ def test_check_lists_what_is_in_doubt(carried_out, damaged):
 def test_times_that_are_not_seconds_stop_a_run_at_once(printed, damaged, tmp_path, left_nothing):
     file = damaged(joints(t=lambda group: 1e3 * group.t))
     told = printed("solve", file, "--out", tmp_path / "run", code=2)
-    assert "joints/t has only one sample every 10 s (at most 0.5 s is allowed). If the times are in millisec" in told
+    assert "times are not in seconds: joints/t has only one sample every 10 s (at most 0.5 s is allowed)" in told
     assert "divide them by 1000" in told
     left_nothing(file)
 

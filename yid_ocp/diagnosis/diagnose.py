@@ -247,7 +247,8 @@ def _with_changed_parameters(
     while left := earlier.shifted_parameters_with_prior(fit, search.thresholds):
         tried = [*released, left[0]]
         search.progress.begin_stage(f"trying a change of {' and '.join(tried)} since the baseline", 1.0, 8.5)
-        refitted = refit_with_effects(_without_priors_of(search.problem, tried), (), fit.values)
+        free = _without_priors_of(search.problem, tried)
+        refitted = refit_with_effects(free, (), fit.values, limits=search.thresholds)
         if refitted is None:
             break
         fit, released = refitted, tried
@@ -285,7 +286,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     if corrected is None:
         return seen
     problem = replace(seen.with_events, problem=corrected)
-    refitted = refit_with_effects(problem, fit.effects, fit.values)
+    refitted = refit_with_effects(problem, fit.effects, fit.values, limits=seen.search.thresholds)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return seen
     gain = 2 * (fit.cost - refitted.cost)

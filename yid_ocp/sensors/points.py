@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols
 from yid_ocp.sensors import base
@@ -55,7 +55,8 @@ def _points(
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
     if lost := [point for point in wanted if point not in group.names]:
-        what, hint = f"the recording has no point '{lost[0]}'", "record or simulate it too, or correct used_points"
+        what, unused = f"the recording has no point '{lost[0]}'", [name for name in group.names if name not in wanted]
+        hint = nearest_name_question(lost[0], unused) or "record or simulate it too, or correct used_points"
         raise DataError(what, where=where, allowed=", ".join(group.names), hint=hint)
     for point in wanted:
         # points listed by name are used
