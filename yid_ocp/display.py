@@ -6,7 +6,7 @@ import html
 import logging
 import re
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -99,6 +99,11 @@ def grouped(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     for key, value in pairs:
         found.setdefault(key, []).append(value)
     return found
+
+
+def effect_entry_label(entry: Mapping[str, Any]) -> str:
+    """Return the label `kind@location` of an effect in a result dictionary."""
+    return f"{entry['kind']}@{entry['location']}"
 
 
 def unseen_effects_sentence(labels: Sequence[str]) -> str:

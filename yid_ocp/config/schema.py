@@ -77,16 +77,18 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     """Make the error for an unknown key `name`. It suggests the nearest `known` key, and sections that have the key."""
     known = list(known)
     homes, near = list(dict.fromkeys(_sections_with_key(RunSettings, name))), nearest_name_question(name, known)
-    hints = [f"'{name}' is a key of {' and of '.join(homes[:3])}"] if homes else [near] if near else []
     # a key of an older version often resembles a present one that means something else
-    hints = [*(hints or [f"leave '{name}' out"]), RENAMED_NAMES_HINT]
+    first = near or f"leave '{name}' out;"
+    if homes:
+        first = f"'{name}' is a key of {' and of '.join(homes[:3])};"
+    hint = f"{first} {RENAMED_NAMES_HINT}"
     if name.partition(".")[0] in known and "." in name:
-        hints = [f"write --set {name}=VALUE, or nested keys in the file, such as parameters: {{NAME: {{free: false}}}}"]
+        hint = f"write --set {name}=VALUE, or nested keys in the file, such as parameters: {{NAME: {{free: false}}}}"
     if ":" in name:
-        hints = ["put a space after the colon, as in {" + name.replace(":", ": ") + "}"]
+        hint = "put a space after the colon, as in {" + name.replace(":", ": ") + "}"
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")
     allowed = unknown_name_error_arguments(name, known)["allowed"]
-    return ConfigError(what, where=where, allowed=allowed, hint="; ".join(hints).replace("?;", "?"))
+    return ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:

@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStati
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, CandidateDetectability, ScoreTestResult
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
-from yid_ocp.display import NULL_PROGRESS
+from yid_ocp.display import NULL_PROGRESS, effect_entry_label
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
 from yid_ocp.errors import DataError
@@ -82,7 +82,7 @@ def score_blind_case(
     """Score a diagnosis result (`yid-diagnosis/2`) against its label. `best`: closure by the true effects, if known."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-        return tuple(f"{e['kind']}@{e['location']}" for e in entries)
+        return tuple(map(effect_entry_label, entries))
 
     verdict, named, listed = str(result["verdict"]), labels(result["effects"]), labels(result["which"])
     groups = [labels(group) for group in result["confusable"]]

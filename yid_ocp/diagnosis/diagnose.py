@@ -262,8 +262,13 @@ def _with_changed_parameters(
         assert shifts is not None  # the priors are those of earlier runs
         rivals = tuple(own for own in shifts.parameter_shifts if own.name in released)
         probability = judged.probability * select.relative_probability(distance)
-        more = replace(judged, verdict="confusable", probability=probability, rival_shifts=rivals)
-        return seen, replace(more, rival_probability=judged.probability - probability)
+        return seen, replace(
+            judged,
+            verdict="confusable",
+            probability=probability,
+            rival_shifts=rivals,
+            rival_probability=judged.probability - probability,
+        )
     with contextlib.suppress(SolverError):
         anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
         if not anew.evidence.residual_exceeds_noise(search.thresholds):

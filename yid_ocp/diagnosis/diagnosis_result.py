@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.screening import ScoreTestResult
 from yid_ocp.diagnosis.select import bic_difference, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence
-from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.display import ReprMixin, ReprTexts, effect_entry_label
 from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
@@ -64,7 +64,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             values = ((name, own["value"], own["unit"]) for name, own in entry["parameters"].items())
             known = ", ".join(f"{name} = {value:.3g} {unit}" for name, value, unit in values if value is not None)
             alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-            rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
+            rows.append((effect_entry_label(entry), known, alone, f"{entry['p_value']:.2g}"))
         return ReprTexts(", ".join(filter(None, said)), rows)
 
     @property

@@ -99,14 +99,15 @@ def linearize_candidates(
         return ProjectedCandidatesLinearization(np.zeros(0), ())
     placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
-    scatter = null_test.encoder_noise_residual_covariance_factor(placed, placed.pack_unknowns(values))[rows.data]
+    x = placed.pack_unknowns(values)
+    scatter = null_test.encoder_noise_residual_covariance_factor(placed, x)[rows.data]
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)
     redrawn = [null_test.episodes_with_noisier_motion(placed, rng) for _ in draws]
     # changes by encoder noise hardly depend on the effects in the model
     known = problem.changes_by_encoder_noise
-    fitted = dict(zip(placed.unknown_names, placed.pack_unknowns(values).tolist(), strict=True))
+    fitted = placed.unknowns.named_values(x)
     held = placed.with_parameter_values({name: fitted[name] for name in placed.shared_parameters})
     grid, sensitivities, warm = [], list[Array](), None
     for point, shapes in enumerate(itertools.zip_longest(*map(_shape_grid, tried))):

@@ -212,5 +212,7 @@ def _check_effect_amplitude_transfer(
     if (again := search.refit_on_held_out(fit)) is None:
         return ()
     names = ((effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names)
-    both = ((of, ((own.values[of[1]], own.std[of[1]]) for own in (fit, again))) for of in names)
-    return tuple(EffectAmplitudeTransferCheck(*of, *estimates) for of, estimates in both)
+    return tuple(
+        EffectAmplitudeTransferCheck(effect, name, *((own.values[name], own.std[name]) for own in (fit, again)))
+        for effect, name in names
+    )

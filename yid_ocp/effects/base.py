@@ -307,7 +307,8 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
     parents, found = {joint.parent_index for joint in tree.joints}, []
     for name in arm_joint_names(system):
-        joint = tree.joints[index := tree.joint_index(name)]
+        index = tree.joint_index(name)
+        joint = tree.joints[index]
         finger = joint.kind == "prismatic" and index not in parents and joint.parent_index >= 0
         frames = [frame for frame, entry in tree.frames.items() if entry.joint_index == index]
         if not finger and frames and joint.bodies:

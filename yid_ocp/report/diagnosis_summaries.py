@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
-from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, p_value_text, unseen_effects_sentence
+from yid_ocp.display import (
+    abbreviated_names_text,
+    count_with_noun,
+    effect_entry_label,
+    grouped,
+    p_value_text,
+    unseen_effects_sentence,
+)
 from yid_ocp.effects import EFFECTS
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
@@ -127,8 +134,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     yield "candidate", "parameters", "closure alone", "p", "verdict"
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
-    verdicts = {_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
-    verdicts |= {_label(own): chosen for own in result.get("effects", ())}
+    verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
+    verdicts |= {effect_entry_label(own): chosen for own in result.get("effects", ())}
     absent = "–" * any(entry["closure"] is not None for entry in result["which"])
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
@@ -140,12 +147,8 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
                 shown = f"= {round(value, 12):.3g}{unit}" if entry["closure"] is None else "unknown"
                 values.append(f"{name} {shown}")
         closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-        label, p = _label(entry), p_value_text(entry["p_value"])
+        label, p = effect_entry_label(entry), p_value_text(entry["p_value"])
         yield label, ", ".join(values), closed, p, verdicts.get(label, "")
-
-
-def _label(entry: Mapping[str, Any]) -> str:
-    return f"{entry['kind']}@{entry['location']}"
 
 
 @register_summary("yid-blind/1")

@@ -159,7 +159,7 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
         known = [e["baselines"] for e in entries]
-        names = [n for n in [*known, {}][0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
+        names = [n for n in next(iter(known), {}) if all(set(channels) <= set(own.get(n, {})) for own in known)]
         guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
         best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
         errors = (error, fitted, noise, guesses.get(best or ""))

@@ -18,7 +18,7 @@ from typing import Any
 
 from yid_ocp.analysis.run_estimates import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, effect_entry_label
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_file_question
 from yid_ocp.files import file_sha256, folder_error, to_json_types, write_strict_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
@@ -170,7 +170,7 @@ def _run_batch_task(
         status, ok, message = result["status"], result["status"] == "converged", result["message"]
     free = {parameter: own for parameter, own in judged.items() if own.get("free", True)}
     parameters = {parameter: {key: own.get(key) for key in _PARAMETER_KEYS} for parameter, own in free.items()}
-    effects = [f"{entry['kind']}@{entry['location']}" for entry in result.get("effects", ())]
+    effects = [effect_entry_label(entry) for entry in result.get("effects", ())]
     found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
     found |= {"effects": effects, "parameters": parameters, "seconds": time.perf_counter() - begun}
     return dict(to_json_types(found))

@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_recording
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, effect_entry_label
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
 from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.step import Step
@@ -209,7 +209,7 @@ def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, f
     sizes = {}
     for entry in result["which"]:
         values = {name: quantity["value"] for name, quantity in entry["parameters"].items()}
-        sizes[f"{entry['kind']}@{entry['location']}"] = {name: x for name, x in values.items() if x is not None}
+        sizes[effect_entry_label(entry)] = {name: x for name, x in values.items() if x is not None}
     return {name: entry["before"] for name, entry in result["absorption"].items()}, sizes
 
 
@@ -235,6 +235,6 @@ def discrimination_plan_settings(
     """Return settings of `plan` for a motion that distinguishes the first confusable effects. None without any."""
     if not confusable:
         return None
-    labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
+    labels = [effect_entry_label(entry) for entry in confusable[0]]
     asked = {"goal": "information", "effects_to_discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS]}
     return asked | {"parameter_run_folder": str(folder)}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import effect_entry_label
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
@@ -186,7 +187,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     promised = {own.effect.label: factor * own.predicted_chi2_decrease for own in finding.screening.candidate_scores}
     entries: dict[str, tuple[tuple[float, float, float] | None, float]] = {}
     for entry in result["which"][:_MAX_CANDIDATES]:
-        name, closed = f"{entry['kind']}@{entry['location']}", None
+        name, closed = effect_entry_label(entry), None
         if entry["closure"] is not None and None not in entry["closure_ci"]:
             low, high = entry["closure_ci"]
             closed = (100 * entry["closure"], 100 * low, 100 * high)
@@ -258,7 +259,7 @@ def _library_curves(table: TorqueLawTable, at: Array) -> dict[str, Array]:
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
     labels = finding.screening.labels
-    names = [f"{entry['kind']}@{entry['location']}" for entry in result["which"][:_MAX_CANDIDATES]]
+    names = [effect_entry_label(entry) for entry in result["which"][:_MAX_CANDIDATES]]
     names = [name for name in names if name in labels]
     if len(names) < 2:
         return None
