@@ -27,6 +27,7 @@ from yid_ocp.solvers import base
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
+_ARMIJO_CONSTANT = 1e-4  # fraction of the predicted decrease of the cost that a step must reach
 _LENGTH_AFTER_FAILURE = 0.25  # of the next step, over that of a rejected one whose trial had no prediction
 # The search ends after this many steps (5 if coarse) that together lower the cost by at most this [units of noise] and
 # move no unknown by more than this [std], if the predicted decrease is at most the cost of a 95 % interval.
@@ -247,7 +248,6 @@ class SteepestDescent(base.SolverWithCheckedSettings):
         Gt(0),
         OptionInfo("converged if the projected gradient times the unknowns' size is below this fraction of the cost"),
     ] = 1e-5
-    armijo_constant: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo constant of sufficient decrease")] = 1e-4
     backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("factor on a rejected step")] = 0.5
     first_trial_step_rule: Annotated[
         Literal["last", "spectral"], OptionInfo("first trial step length of an iteration; last: Caldwell et al. (2014)")
@@ -284,7 +284,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 trial = np.clip(x - length * gradient, lower, upper)
                 attempt = problem.evaluate(trial, False, evaluation.equilibrium_guesses)
                 recorder.n_evaluations += 1
-                if attempt.ok and attempt.cost <= reference - self.armijo_constant * float(gradient @ (x - trial)):
+                if attempt.ok and attempt.cost <= reference - _ARMIJO_CONSTANT * float(gradient @ (x - trial)):
                     break
                 length *= self.backtracking_factor
                 if np.max(np.abs(length * gradient) / size) < 1e-12:

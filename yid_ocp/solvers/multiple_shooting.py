@@ -76,14 +76,12 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         HessianKind, OptionInfo("Hessian of the Lagrangian in IPOPT; exact adds the curvature of equations and sensors")
     ] = "gauss_newton"
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on iterations")] = 200
-    ipopt_tolerance: Annotated[float, Gt(0), OptionInfo("IPOPT's option tol")] = 1e-6
     step_tolerance: Annotated[
         float, Gt(0), OptionInfo("condensing: converged if no unknown moves by more than this fraction of its size")
     ] = 1e-5
     cost_tolerance: Annotated[
         float, Gt(0), OptionInfo("condensing: converged if the predicted relative decrease of the cost is below this")
     ] = 1e-5
-    relative_mu_init: Annotated[float, Gt(0), OptionInfo("initial barrier parameter, over the initial cost")] = 1e-7
     ipopt_options: Annotated[dict[str, Any], OptionInfo("IPOPT options that prevail")] = field(default_factory=dict)
     name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
@@ -141,10 +139,10 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         return base.SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
-        told = {"max_iter": self.max_iterations, "tol": self.ipopt_tolerance, "mu_init": self.relative_mu_init}
         acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {
             **{"obj_scaling_factor": cost_factor, "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"},
+            **{"max_iter": self.max_iterations, "tol": 1e-6, "mu_init": 1e-7},
             # the Hessian is positive definite, but MUMPS misjudges signs of tiny pivots, and IPOPT would regularise
             "neg_curv_test_tol": 1e-11 if self.hessian == "gauss_newton" else 0.0,
             # measured on 50 variables and 500 steps: a sixth of the time of MUMPS's own choice
@@ -152,7 +150,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
             **{"bound_relax_factor": 0.0, "fixed_variable_treatment": "make_parameter"},
             **{f"acceptable_{name}": value for name, value in acceptable.items()},
         }
-        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt_options}}
+        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt_options}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[base.Status, str]:
         closed = f"The largest jump between time steps (defect) is {defect:.1e}, and should be near 0"

@@ -26,7 +26,6 @@ from yid_ocp.vision.sequence_calibration import (
     TubeDimensionKind,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import UrdfMeshKind
 from yid_ocp.vision.track_result import FrameReport
 
 
@@ -90,7 +89,6 @@ class TrackOptions:
     approximate_root_position: Annotated[
         XyzTuple | None, OptionInfo("position nearer to the root than to other ends, unless root is model", "m")
     ] = None
-    robot_mesh_kind: Annotated[UrdfMeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
     seed: Annotated[int, Ge(0), OptionInfo("random seed of subsampling and skeleton extraction")] = 0
 
     def __post_init__(self) -> None:

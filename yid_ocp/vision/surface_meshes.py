@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -36,7 +36,6 @@ from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision import frames
 
-UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
 _MAX_MESH_BYTES = 1 << 28
@@ -261,10 +260,8 @@ def _tensor(values: NDArray[Any]) -> Any:
     return frames.import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def load_robot_meshes_by_joint(
-    urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual"
-) -> dict[int, TriangleMesh]:
-    """Load meshes of a robot's links by joint index, in the joint's frame. Index -1 is the fixed base.
+def load_robot_meshes_by_joint(urdf: str | Path, mechanism: Mechanism) -> dict[int, TriangleMesh]:
+    """Load the visual meshes of a robot's links by joint index, in the joint's frame. Index -1 is the fixed base.
 
     `urdf` is a file or `package:baxter`. `mechanism` (numeric) contains this robot, alone or within a larger mechanism.
     Raises `ModelError` if the file or a mesh is missing or unreadable, or if there is no mesh at all.
@@ -286,7 +283,7 @@ def load_robot_meshes_by_joint(
     for link in robot.robot.links:
         if link.name not in mechanism.frames:
             continue
-        for shape in link.visuals if kind == "visual" else link.collisions:
+        for shape in link.visuals:
             geometry, origin = shape.geometry, np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
             tube = geometry.cylinder and (geometry.cylinder.radius, geometry.cylinder.length)
             mesh = _solid(geometry.box and geometry.box.size, tube, geometry.sphere and geometry.sphere.radius)
@@ -298,7 +295,7 @@ def load_robot_meshes_by_joint(
                 joint, placement = _carrier(mechanism, link.name)
                 parts.setdefault(joint, []).append(mesh.transformed(placement @ origin))
     if not parts:
-        what, hint = f"the URDF has no {kind} meshes", "set track.options.robot_mesh_kind to visual or collision"
+        what, hint = "the URDF has no visual shapes", "add visual meshes or primitive shapes to its links"
         raise ModelError(what, where=str(path), allowed="a URDF with meshes or primitive shapes", hint=hint)
     return {joint: TriangleMesh.concatenate(entries) for joint, entries in parts.items()}
 

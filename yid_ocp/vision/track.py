@@ -127,7 +127,7 @@ class SingleFrameTracker:
         tree = system.mechanism_with_values(values)
         meshes = surface_meshes.extra_meshes_by_joint_index(scene.surfaces_missing_from_urdf, tree)
         if scene.robot_urdf is not None:
-            robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree, options.robot_mesh_kind)
+            robot = surface_meshes.load_robot_meshes_by_joint(scene.robot_urdf, tree)
             if all(joint < 0 for joint in robot):
                 what, where = "no link that the model's joints move has a mesh in this URDF", str(scene.robot_urdf)
                 allowed = "a URDF with meshes of moved links, by which `track` removes the arm from the clouds"

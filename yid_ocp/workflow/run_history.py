@@ -15,7 +15,6 @@ import numpy as np
 from yid_ocp.analysis import run_estimates
 from yid_ocp.analysis.discretisation import EXTRAPOLATION_FACTOR
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.schema import RENAMED_NAMES_HINT
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
@@ -38,7 +37,6 @@ log = logging.getLogger(__name__)
 
 ESTIMATE_FORMAT_BY_COMMAND = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
-_OLD_FORMATS = ("yid-diagnosis/1",)  # formats of earlier versions, with other keys
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "object", "grasp", "joint_springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
@@ -111,7 +109,7 @@ def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Read the result.json of any command. Raises `DataError` if it cannot be read or has an old format."""
+    """Read the result.json of any command. Raises `DataError` if it cannot be read."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         what = f"{file.parent} {'has no finished run' if file.parent.is_dir() else 'is not an existing folder'}"
@@ -120,10 +118,6 @@ def read_result_file(file: Path) -> dict[str, Any]:
     if not isinstance(result, dict):
         what, hint = "the file does not have the result of a run", "repeat the command that made the folder"
         raise DataError(what, where=str(file), allowed="result.json as a command wrote it", hint=hint)
-    if result.get("format") in _OLD_FORMATS or "doubts" in result:  # an old key
-        what = f"an earlier version wrote this result ({result.get('format')}), with other names of keys"
-        what, hint = f"{what}; {RENAMED_NAMES_HINT}", f"repeat it with this version: {result.get('command', 'the run')}"
-        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_FORMAT_BY_COMMAND.values()), hint=hint)
     return result
 
 
