@@ -104,10 +104,10 @@ JOINTS = ("shoulder", "elbow")
 def moved(urdf_folder):
     """A double pendulum moved as measured, with an effect's values at its elbow; what its joints need is seen."""
 
-    def make(kind, truth, free, seed=0):
+    def make(kind, truth, free, seed=0, places=("elbow",)):
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")
         plain = System.build(robot, springs={"shoulder": StiffnessAndRest(6.0, 0.1)}, prescribed=JOINTS)
-        system = plain.with_effects([make_effect(kind, "elbow", plain)])
+        system = plain.with_effects([make_effect(kind, place, plain) for place in places])
         step = compile_step(system, H, use_compiler=False)
         t = H * np.arange(N_STEPS + 1)
         path = np.stack([0.6 * np.sin(2.1 * t), 0.9 + 0.3 * np.sin(3.3 * t + 0.4)], axis=1)
@@ -118,7 +118,7 @@ def moved(urdf_folder):
         recorded = np.vstack([effort, effort[-1]]) + noise
         group = JointGroup(JOINTS, t, path, effort=recorded, effort_std=STD, position_std=0.0)
         options = ProblemOptions(path_cutoff=np.inf)
-        names = [f"{kind}@elbow.{name}" for name in free]
+        names = [f"{kind}@{place}.{name}" for place in places for name in free]
         return EstimationProblem(step, [Recording(group, name="twin")], ["shoulder.stiffness", *names], options)
 
     return make
@@ -143,6 +143,14 @@ def test_an_amplitude_seen_at_its_neutral_value_begins_there_and_one_given_at_it
     for begun in (problem, fixed, free.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})):
         x = begun.initial_unknowns
         np.testing.assert_array_equal(unknowns_with_neutral_effects_activated(begun, x), x)
+
+
+def test_effects_that_begin_neutral_share_one_evaluation(moved, monkeypatch):
+    problem, points = moved("joint_viscous", {"b": 0.3}, ("b",), places=JOINTS), []
+    plain = problem.evaluate
+    monkeypatch.setattr(problem, "evaluate", lambda x: points.append(x) or plain(x))
+    unknowns_with_neutral_effects_activated(problem, problem.initial_unknowns)
+    assert len(points) == 1
 
 
 @pytest.mark.parametrize(("kind", "name"), [("joint_viscous", "b"), ("joint_coulomb", "tau_c")])

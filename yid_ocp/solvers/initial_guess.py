@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
@@ -154,6 +155,8 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
     zero there. An effect also keeps it if the rollout fails with every smaller amplitude that is tried.
     """
     place = {name: i for i, name in enumerate(problem.unknown_names)}
+    # effects without shapes, such as the friction of many joints, need the same point
+    evaluate = functools.lru_cache(1)(lambda point: problem.evaluate(np.array(point)))
     for effect in problem.system.effects:
         if not isinstance(effect, EffectBase):
             continue
@@ -161,7 +164,7 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
         amplitudes = [name for name in effect.amplitude_parameter_names if name in free]
         if not amplitudes or any(x[place[name]] != effect.neutral_values[name] for name in amplitudes):
             continue
-        begun = _with_effect_begun(problem, x, effect, place)
+        begun = _with_effect_begun(problem, x, effect, place, evaluate)
         if begun is None:
             continue
         for pull in _START_FRACTIONS:
@@ -173,7 +176,13 @@ def unknowns_with_neutral_effects_activated(problem: EstimationProblem, x: Array
     return x
 
 
-def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase, place: dict[str, int]) -> Array | None:
+def _with_effect_begun(
+    problem: EstimationProblem,
+    x: Array,
+    effect: EffectBase,
+    place: dict[str, int],
+    evaluate: Callable[[tuple[float, ...]], Evaluation],
+) -> Array | None:
     """The start with an effect at its best shape; None if only its amplitude is free, and observable at neutral."""
     amplitudes = [place[name] for name in effect.amplitude_parameter_names if name in place]
     shapes = [place[name] for name in effect.shape_parameter_names if name in place]
@@ -183,16 +192,16 @@ def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase,
     for values in itertools.product(*grids):
         trial = x.copy()
         trial[shapes] = values
-        found = problem.evaluate(trial)
+        found = evaluate(tuple(trial.tolist()))
         if not found.ok or found.jacobian is None:
             continue
         blind = blind and not np.any(found.jacobian[problem.residual_rows.data][:, amplitudes])
+        if not shapes and not blind:
+            return None
         step, fall = _amplitude(problem, trial, found, amplitudes)
         if fall > most:
             best, most = trial, fall
             best[amplitudes] += step
-    if not shapes and not blind:
-        return None
     for at in amplitudes:
         low, high = expected[at]
         width, least = high - low, _MIN_AMPLITUDE_FRACTION * (high - low)
