@@ -83,8 +83,8 @@ def _lead(result: DiagnosisResult) -> str:
     tests, limits = (result.nominal_test, result.nominal_held_out_test), result.thresholds
     fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
-    p_value = p_value_text(min(test.p_value for test in tests))
-    chance = f"and so large an error with a probability of {p_value}"
+    p_value = p_value_text(min(test.p_value for test in tests), "of ")
+    chance = f"and so large an error with a probability {p_value}"
     best, along = _best_candidate(result)
     large = f"The nominal model has an error beyond noise (a gap): {sizes}, {chance}."
     small = f"In total the error of the nominal model is within noise: {sizes}. "
