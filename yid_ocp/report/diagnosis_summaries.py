@@ -99,8 +99,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
     missing = result.get("not_candidates", {}).items()
-    lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
-    yield f"No recording has these signals, so their effects were not tried: {', '.join(lacking)}." if lacking else ""
+    lacking = [f"{', '.join(kinds)} ({_SIGNAL_TEXTS.get(signals, signals)})" for signals, kinds in missing]
+    yield f"Not tested, because no recording has the signals in brackets: {'; '.join(lacking)}." if lacking else ""
     beside = " (with the effects)" if result.get("rival_changes", {}).get("parameters") else ""
     rows = [("parameter", "baseline", f"now{beside}", "unit", "change / its std", "verdict")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
@@ -427,7 +427,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
     said = f"These recordings do not determine {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
-    yield SummaryTable(rows, f"Held-out error of each law [{unit}]".replace("[std]", "/ noise"), is_key_table=True)
+    yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
