@@ -440,7 +440,7 @@ def _friction_constant_words(name: str, unit: str) -> str:
     """Return meaning, symbol and unit of a constant of a friction law, such as `joint_coulomb@elbow.tau_c`."""
     kind, symbol = name.partition("@")[0], name.rpartition(".")[2]
     known = {own.name: own.description for own in EFFECTS[kind].declared_parameters} if kind in EFFECTS else {}
-    return f"{known.get(symbol, 'viscous friction')} {symbol} [{unit}]".removesuffix(" [1]")
+    return f"{known.get(symbol, 'viscous friction')} ({symbol}) [{unit}]".removesuffix(" [1]")
 
 
 @register_summary("yid-history/1")
@@ -580,7 +580,7 @@ def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
         is_good = ratios[worst] < _MAX_REPRODUCED_ERROR
         text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}: the largest error"
-        yield f"{text} (of {worst}) is {ratios[worst]:.4g} times its noise (allowed: {_MAX_REPRODUCED_ERROR})."
+        yield f"{text} (of {worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
         if not is_good and "joints.position" in gate["channels"]:  # arms move by their torques
             text = "Errors of recorded torques can cause this too. To exclude them, solve and export again with"
             yield f"{text} --set model.arms.mode=prescribed, which moves the arms as measured."
