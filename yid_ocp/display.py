@@ -65,7 +65,7 @@ def p_value_text(p_value: float, relation: str = "") -> str:
 
 
 def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES_IN_LINE) -> str:
-    """Join names to one line of text. Three or more names with consecutive numbers are merged, as in `joint1..7`.
+    """Join names to one line of text. Three or more with consecutive numbers are merged, as in `joint1 to joint7`.
 
     The line has at most `max_entries` entries, followed by the number of omitted names.
     """
@@ -84,7 +84,7 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
                     break
                 run.append(parts.index(following))
             if len(run) > max(2, len(longest)) and not taken.intersection(run):
-                longest, text = run, "".join([*own[: at + 1], "..", parts[run[-1]][at], *own[at + 1 :]])
+                longest, text = run, f"{names[i]} to {names[run[-1]]}"
         taken.update(longest)
         if len(said) < max_entries:
             said.append(text)

@@ -48,7 +48,7 @@ def test_springs_that_cannot_be_told_apart(carried_out, repository):
     assert (result["start"], result["nuisances"]) == ("unknown", 4)
     for entry in result["parameters"].values():
         assert entry["interval"] == [pytest.approx(1.2, rel=0.02), None]
-    parts = "What another experiment would identify", "cannot be found"
+    parts = "What another experiment would find", "cannot be found"
     assert all(part in (done.folder / "report.html").read_text() for part in parts)
     assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in done.folder.iterdir()}
 

@@ -84,11 +84,11 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved())
     assert lines[0].startswith("p_at_bound ended at the lower bound"), "no value is safe"
     size, text = "chi2 per degree of freedom is 1.03; noise alone gives 1", " ".join(lines)
-    assert "These recordings do not determine the following parameters: p_not_identifiable." in text
-    assert "1 of 4 free parameters are found to within 10 % of their value" in text
+    assert "These recordings do not determine p_not_identifiable. To find an experiment that" in text
+    assert "1 of 4 free parameters are found: their ± (one standard deviation) is at most 10 % of the value" in text
     assert "These parameters are only weakly determined: p_weak. Use their 95 % intervals, which are rough." in text
     assert f"The model explains the recordings to within their noise ({size})." in text
-    assert all(fact in lines[-1] for fact in ("converged", "done", "4 iterations", "1.0 s"))
+    assert all(fact in lines[-1] for fact in ("converged", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
     assert not any("p_fixed" in line for line in lines)
     poor = {"p": parameter("not_trusted", 9.0) | {"upper": 9.0}}
@@ -105,9 +105,8 @@ def test_a_solve_says_what_is_not_found():
     issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
     both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
     lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
-    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak)." in " ".join(lines)) == (True, True)
-    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "2"]
-    assert "±" not in "".join(lines[lines.index(line_of(lines, "a")) :])
+    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak). To" in " ".join(lines)) == (True, True)
+    assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
     parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"
     assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
@@ -139,7 +138,6 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     doubtful = information(parameters={"a": judged("not_trusted")}, fit=BAD, directions=[change])
     lines = told("yid-identifiability/1", doubtful)
     assert (" ".join(lines[:3]), "a -160 %, b +120 %" in lines) == (first, True)
-    assert "in doubt: the model does not explain the recordings, so the value may be wrong even if" in " ".join(lines)
     assert line_of(lines, "find the cause of the model's error").endswith(" yid-ocp diagnose CONFIG")
 
 
@@ -149,8 +147,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
         (0.012, 0.010, GOOD, None),
         (0.012, 0.002, GOOD, "points shows a gap. Before you use any value, run `yid-ocp diagnose`. The rms error of"),
         (0.003, 0.002, GOOD, None),
-        (0.003, 0.002, BAD, "is 3 mm on held-out and 1.8 mm on fitted recordings. Noise alone gives 2 mm. The guess"),
-        (0.003, 0.03, BAD, "gives 30 mm, mostly because errors of the torques carry the arm away (chi2 acc"),
+        (0.003, 0.002, BAD, "is 3 mm on held-out and 1.8 mm on fitted recordings; noise alone gives 2 mm."),
     ],
 )
 def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
@@ -159,7 +156,7 @@ def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
     known["parameters"] = {"a": parameter("identifiable")}
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:15]))
-    assert ("Use these values within" in text) == (fit is GOOD and error < 6 * noise)
+    assert ("You can use these values" in text) == (fit is GOOD and error < 6 * noise)
     assert ("1.8 mm" in text.partition("parameter  ")[0], (said or "") in text) == (bool(said), True)
 
 
@@ -177,14 +174,14 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
-    said = "With twice the links, these estimates would change by more than their ± from the data: p.a by -5.5"
-    rest = "With half the time step, no estimate would change by more than its ± from the data."
+    said = "Twice the links would change these estimates by more than their ± from noise: p.a by -5.5 (± 0.073)."
+    rest = "Half the time step would change no estimate by more than its ± from noise."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "To reduce these errors, set model.object.links: 8, and solve again."
-    assert lines[at + 1 : at + 4] == ["(± 0.073). The ± of the table includes this.", rest, cure]
+    assert lines[at + 1 : at + 4] == ["The ± of the table includes this.", rest, cure]
     noisy = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
     ends = [" ".join(told("yid-solve/1", solved(discretisation=noisy, status=s))) for s in ("converged", "stalled")]
-    assert [("or with the noise of joint" in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]
+    assert [("or additional noise of the joint" in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]
 
 
 def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
@@ -198,7 +195,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods fit equally well, because their costs differ by 0 at most." in lines) == (said, True)
+    assert (lines[0], "All methods fit equally well: their costs hardly differ (0 at most)." in lines) == (said, True)
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
@@ -236,16 +233,14 @@ def test_a_simulation_that_failed_and_one_that_did_not():
 
 
 def test_blocks_on_a_terminal():
-    table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
+    table = SummaryTable([("a", "b"), ("1", "2")], "T")
     assert terminal.summary_terminal_lines([]) == []
     blocks = [table, SummaryStatement("said"), table, replace(table, is_page_only=True), CodeBlock("do it\nnow")]
     assert terminal.summary_terminal_lines(blocks) == [
-        "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
+        "T:", "a  b", "-  -", "1  2", "", "said", "", "T:", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
     prose = terminal.summary_terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])
     assert max(map(len, prose)) <= 100
-    note = terminal.summary_terminal_lines([SummaryStatement("a note " * 40)])
-    assert all(line.startswith("  ") for line in note[1:])
 
 
 def test_tables_are_aligned_without_empty_columns():
@@ -284,10 +279,10 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
 @pytest.mark.parametrize(
     ("names", "said"),
     [
-        ([f"joint_coulomb@joint{i}.tau_c" for i in range(1, 8)], "joint_coulomb@joint1..7.tau_c"),
+        ([f"a@joint{i}.tau_c" for i in range(1, 8)], "a@joint1.tau_c to a@joint7.tau_c"),
         (["T1.bend", "T2.bend"], "T1.bend, T2.bend"),
-        (["j1.damping", "tip.mass", "j3.damping", "j2.damping", "j5.damping"], "j1..3.damping, tip.mass, j5.damping"),
-        ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9..11, w1.x9..11"),
+        (["j1.c", "tip.mass", "j3.c", "j2.c", "j5.c"], "j1.c to j3.c, tip.mass, j5.c"),
+        ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9 to w0.x11, w1.x9 to w1.x11"),
         (["j01.c", "j02.c", "j03.c", ""], "j01.c, j02.c, j03.c, "),
         ([f"{c}.gain" for c in "abcdefghijklmnopqrst"], ", ".join(f"{c}.gain" for c in "abcdefghijkl") + " and 8 more"),
         ([], ""),

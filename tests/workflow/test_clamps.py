@@ -181,7 +181,7 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, printed):
     assert [name for name, entry in written["parameters"].items() if entry["drifted"]] == ["beam.bend"]
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == ["day3"]
     page = (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
-    assert all(own in page for own in ("differs between the runs, from 0.02 in day0 to 0.025", "(day0..2) agree with"))
+    assert all(own in page for own in ("differs between the runs, from 0.02 in day0 to 0.025", "(day0 to day2) agree"))
     later, older = (folder_of(tmp_path / name) for name in ("later", "older"))
     (later / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{baseline_run_folders: [{folders[0]}]}}\n", "utf-8")
     (older / "config.yaml").write_text(f"{BEAM}\ndiagnosis: {{worth: 3}}\n", "utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from pathlib import Path
 
@@ -167,17 +168,20 @@ def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
     names += [f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz"] + [f"tip_{axis}" for axis in "xyz"]
     rows = [",".join(["0.01" if k else "0", *(f"{math.sin(0.1 * k + i):.4f}" for i in range(29))]) for k in range(2)]
     (odd / "run.csv").write_text("\n".join([",".join(["t", *names]), *rows]))
-    told = [line.split() for line in printed("import", "run.csv", "--preview").splitlines()]
-    shown = ["q_joint1..7", "tau_joint1..7", *(f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz")]
+    told = [re.split(r"\s{2,}", line) for line in printed("import", "run.csv", "--preview").splitlines()]
+    shown = [
+        *(f"{of}_joint1 to {of}_joint7" for of in ("q", "tau")),
+        *(f"m{i}_{axis}" for i in (1, 2, 3, 5) for axis in "xyz"),
+    ]
     assert [words[0] for words in told[3:17]] == shown
-    assert told[3][-1] == "position:joint1..7"
+    assert told[3][-1] == "position:joint1 to position:joint7"
     sources = json.loads(printed("import", "run.csv", "--preview", "--json"))["sources"]
     assert [source["name"] for source in sources] == ["t", *names]
-    assert "m1..3, m5, tip" in printed("import", "run.csv", "--out", "run.h5")
+    assert "m1 to m3, m5, tip" in printed("import", "run.csv", "--out", "run.h5")
     told = printed("init", "package:xarm7", "run.h5", "--out", "run.yaml")
-    assert "joints: joint1..7\n" in told
+    assert "joint1 to joint7\n" in told
     for text in (told, (odd / "run.yaml").read_text()):
-        assert "`init` leaves out recorded m1..3, m5, tip, because" in text
+        assert "`init` leaves out recorded m1 to m3, m5, tip, because" in text
 
 
 def test_no_command_is_suggested_that_would_fail(odd, printed):

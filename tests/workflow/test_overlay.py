@@ -47,7 +47,7 @@ def test_two_runs_of_the_same_recordings_are_overlaid(two_runs, printed, tmp_pat
             apart = np.array(paths[1]["predicted"])[:, at] - np.array(paths[0]["predicted"])[:, at]
         assert e["difference"] == pytest.approx(np.sqrt(np.nanmean(apart**2))), joint
     assert f"{other['parameters'][fixed]['value']:.4g} (fixed)" in told
-    assert f"These parameters differ by more than 2 std: {fixed}" in told
+    assert f"differ by more than 2 standard deviations in these parameters: {fixed}" in " ".join(told.split())
     page = (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
     names = ["verdict", "scene", "days", "overlay", "numbers"]
     assert [name for name in re.findall(r'<section id="(\w+)">', page) if name != "inputs"] == names

@@ -23,8 +23,8 @@ from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.report.summaries import _noise_words
-from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table_rows
+from yid_ocp.report.summaries import _noise_cells
+from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.check import _fine_time_step, _input_noise, _too_stiff_start_warnings
@@ -144,14 +144,12 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
         return {"value": value, "std": 0.012, "prior_std": prior}
 
     offsets = {"a": {"s0": offset(0.4), "e0": offset(-0.1)}, "b": {"s0": offset(0.2, 0.1)}}
-    assert torque_offset_table_rows({"torque_offsets": offsets}) == [
-        ("estimated torque offset [N m]", "a", "b", "expected size"),
+    assert torque_offset_table({"torque_offsets": offsets}).rows == [
+        ("joint", "a", "b", "expected size"),
         ("s0", "0.40 ± 0.01", "0.20 ± 0.01", "± 0.3, ± 0.1"),
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
-    many = {f"run {i}": {"s0": offset(0.1)} for i in range(6)}
-    assert torque_offset_table_rows({"torque_offsets": many})[-1][0].endswith("2 more recordings")
-    assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1
+    assert len(torque_offset_table({"torque_offsets": {}}).rows) == len(torque_offset_table({}).rows) == 1
 
 
 def simulated(problem, seeds):
@@ -180,9 +178,9 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     effort, position = noise["joints.effort"], noise["joints.position"]
     assert (effort["estimated"], position["estimated"]) == (estimated, False)
     assert (effort["bias_std"], position["std"]) == (OFFSET, ANGLE)
-    words = _noise_words(noise, "joints")
-    assert ("(estimated)" in words) is estimated
-    assert ("(unknown offset: ± 0.2 N m)" in words, words.endswith("; position 0.0001 rad")) == (True, True)
+    by_effort, by_position = _noise_cells(noise)
+    assert by_effort[2:] == ("0.2 N m", "estimated" if estimated else "stated")
+    assert by_position == ("joints.position", "0.0001 rad", "", "stated")
     calm = problem_with_exact_inputs(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}
 
@@ -281,8 +279,8 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
     told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
     assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
-    lacking = "without the error of the time step; left out as too uncertain: T1.twist)"
-    assert lacking in next(copyable_estimates_blocks({"to_use": rough}))
+    stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
+    assert ("without the error of the time step):" in stated, "not listed: T1.twist." in lacking) == (True, True)
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
     assert told["mjcf"] == ['<joint stiffness="22"/> <!-- T1 bend, 4 links; for n links, multiply by n/4 -->']

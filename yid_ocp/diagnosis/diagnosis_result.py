@@ -59,7 +59,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     def _summary(self) -> ReprTexts:
         closed = total_gap_closure(self.accepted_selected_effects).text
         said = [self.verdict.replace("_", " "), *(e.label for e in self.accepted_effects), closed]
-        rows = [("candidate", "parameters", "closure alone", "p")]
+        rows = [("effect", "parameters", "removed error", "p-value")]
         for entry in judgement_to_dict(self, self, ())["which"][:8]:
             values = ((name, own["value"], own["unit"]) for name, own in entry["parameters"].items())
             known = ", ".join(f"{name} = {value:.3g} {unit}" for name, value, unit in values if value is not None)

@@ -53,7 +53,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         "unknown": _said((movable, most), (True, larger))[0],
         "no_gap": "Nothing is needed for motions like these. Other motions may still show a gap.",
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
-        "effect": "Record and diagnose other motions. If the named cause is right, its estimates stay the same.",
+        "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
     }
     return _said(*rows, (True, texts[result.verdict]))[0]
 
@@ -83,10 +83,10 @@ def _lead(result: DiagnosisResult) -> str:
     tests, limits = (result.nominal_test, result.nominal_held_out_test), result.thresholds
     fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
-    p_value = p_value_text(min(test.p_value for test in tests), "= ")
-    chance = f"(p {p_value}: the probability that noise alone gives such an error)"
+    p_value = p_value_text(min(test.p_value for test in tests), "of ")
+    chance = f"and so large an error with a probability {p_value}"
     best, along = _best_candidate(result)
-    large = f"The nominal model has an error beyond noise (a gap): {sizes} {chance}."
+    large = f"The nominal model has an error beyond noise (a gap): {sizes}, {chance}."
     small = f"In total the error of the nominal model is within noise: {sizes}. "
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
     gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
@@ -102,7 +102,7 @@ def _lead(result: DiagnosisResult) -> str:
     since += f"changed since the baseline: {moved}."
     shares = sorted([(result.probability, probable), (result.rival_probability, since)], reverse=True)
     probable = " ".join(text for share, text in shares if share)
-    none = f"Use the model for motions like these. There is no relevant gap: {sizes} {chance}. The recordings {shown}."
+    none = f"Use the model for motions like these. There is no relevant gap: {sizes}, {chance}. The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
     why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
@@ -154,12 +154,11 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     assert result.smoother_result is not None  # it found the locations
     origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
     parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
-    named = [f"{100 * part:.0f} % from {place}" for part, place in parts]
-    named += _said((rest >= MIN_GAP_SHARE, f"{100 * rest:.0f} % from elsewhere"))
-    said = ", ".join(named).replace("% from", "% comes from", 1)
+    named = [f"{place} ({100 * part:.0f} %)" for part, place in parts]
+    named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
-    side = _said((is_told, f"; its origin is {GAP_ORIGIN_TEXTS[origin]}"))
-    return f"Of the error beyond noise that can be located, {said}{''.join(side)}."
+    side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
+    return f"The error beyond noise, as far as it can be located, comes from {', '.join(named)}.{''.join(side)}"
 
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
@@ -226,9 +225,9 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = f"no effect that was tried both has a size above {limits.min_z:g} ± and explains the error well enough"
+    tried = f"no tried effect both has a size above {limits.min_z:g} times its ± and explains the error well enough"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
-    limit = f"with the remaining error in its ±, it is less than {limits.min_z:g} ± from no effect"
+    limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
     more = f"Leave out diagnosis.candidates, if it is set, to try more than {', '.join(kinds)}."
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."

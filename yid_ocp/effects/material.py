@@ -59,7 +59,7 @@ class _SpringChange(_SegmentEffect):
 
 @EFFECTS.register("kelvin_voigt")
 class _KelvinVoigt(_SegmentEffect):
-    """Kelvin-Voigt damping on all joints of a segment, F = -tau kappa v with the joint stiffness kappa."""
+    """Kelvin-Voigt damping on all joints of a segment: F = -tau kappa v (joint stiffness kappa, speed v)."""
 
     equation = "F = -tau kappa v"
     required_excitation = "the speed"

@@ -483,7 +483,8 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
     """
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "It is not known whether the model explains the recordings."
-    size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}; noise alone gives 1"
+    chi2 = f"{chi2_per_dof:.3g}" if chi2_per_dof < 1000 else f"{chi2_per_dof:.0f}"
+    size = f"chi2 per degree of freedom is {chi2}; noise alone gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
         chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
         said = "It is not certain whether the model explains the recordings, because noise may cause the error"

@@ -193,7 +193,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: Stiffness
     """Make the parameters `JOINT.stiffness` and `JOINT.rest` for the spring of a robot joint."""
     unit, rest = tree.joints[tree.joint_index(joint)].unit, f"where the spring on {joint} is relaxed"
     return (
-        Parameter(f"{joint}.stiffness", spring.stiffness, unit("N m/rad"), 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.stiffness", spring.stiffness, unit("N m/rad"), 0.0, math.inf, f"stiffness of {joint}"),
         Parameter(f"{joint}.rest", spring.rest_position, unit("rad"), description=rest),
     )
 

@@ -35,7 +35,8 @@ from yid_ocp.report.terminal import (
     next_steps_table,
     register_summary,
     scale_and_unit_with_metres_as_mm,
-    torque_offset_table_rows,
+    shown_unit,
+    torque_offset_table,
     unused_efforts_sentence,
     value_text_and_display_unit,
 )
@@ -66,59 +67,54 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(part, "verdict") for part in parts)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
     added = (f"+ {step['added']}" for step in steps)
-    rows: TableRows = [("held-out error (rms)", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
+    rows: TableRows = [("channel", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
     for channel, error in before["rmse"].items():
         errors = [error, *(step["rmse"].get(channel) for step in steps), *([noise.get(channel)] if noise else [])]
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
-    yield SummaryTable(rows, "Errors on held-out recordings", is_key_table=True)
-    rows = [("where", "share of the gap", "when [s]")]
+    yield SummaryTable(rows, "Errors (rms) on held-out recordings", is_key_table=True)
+    rows = [("location", "share", "times [s]")]
     for place in result.get("where", ()):
         if place["share"] > _MIN_GAP_SHARE:
             when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             alike = " or ".join([place["location"], *place["indistinguishable_from"]])
             rows.append((alike, f"{100 * place['share']:.1f} %", when + more))
-    yield SummaryTable(rows, "Where the gap lies")
-    rows = [("event", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "its unit")]
+    yield SummaryTable(rows, "Where and when the error beyond noise arises")
+    rows = [("channel", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "unit of the impulse")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
-    yield SummaryTable(rows, "Events (pushes and wrong samples)")
-    rows = [*_candidate_rows(result)]
-    yield SummaryTable(rows, "Candidates")
-    order = "Refitted candidates come first, by held-out error, then the others, by p. Values without ±: forecasts. "
-    order += "Closure alone: part of the held-out error beyond noise that it removes (negative: the error grows)."
-    yield order if any(entry["closure"] is not None for entry in result["which"]) else ""
-    yield "p: probability that noise alone resembles the effect as much." if result["which"] else ""
+    yield SummaryTable(rows, "Pushes and wrong samples")
+    fitted, untried = _candidate_rows(result)
+    yield SummaryTable(fitted, "Effects that were fitted, and the part of the held-out error beyond noise each removes")
     possible = "Possible: not accepted yet, because another cause may explain the error as well."
-    yield possible if any("possible" in row for row in rows) else ""
-    yield f"{left} more candidates are in result.json." if (left := len(result["which"]) - _MAX_CANDIDATES) > 0 else ""
+    yield possible if any("possible" in row for row in fitted) else ""
+    is_page_only = len(fitted) > 1 or verdict == "no gap"
+    yield SummaryTable(untried, "Effects that were not fitted, with forecasts of their size", is_page_only=is_page_only)
+    yield "p-value: probability that noise alone resembles the effect as much." if verdict != "no gap" else ""
+    yield f"result.json has all {count} effects that were tested." if (count := len(result["which"])) else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
-    places = grouped(label.partition("@")[::2] for label in unseen)
-    rows = [("effect", "places"), *((kind, ", ".join(own)) for kind, own in places.items())]
-    yield SummaryTable(rows, "Effects that these recordings would not show", is_page_only=True)
     missing = result.get("not_candidates", {}).items()
-    lacking = [f"{_SIGNAL_TEXTS.get(signals, signals)} ({', '.join(kinds)})" for signals, kinds in missing]
-    yield f"No recording has these signals, so their effects were not tried: {', '.join(lacking)}." if lacking else ""
+    lacking = [f"{', '.join(kinds)} ({_SIGNAL_TEXTS.get(signals, signals)})" for signals, kinds in missing]
+    yield f"Not tested, because no recording has the signals in brackets: {'; '.join(lacking)}." if lacking else ""
     beside = " (with the effects)" if result.get("rival_changes", {}).get("parameters") else ""
-    rows = [("parameter", "baseline", f"now{beside}", "unit", "moved by", "verdict")]
+    rows = [("parameter", "baseline", f"now{beside}", "unit", "change / its std", "verdict")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
-        moved = "no information" if entry["score"] is None else f"{entry['score']:+.2g} std"
-        rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
-    yield SummaryTable(rows, "Since the baseline")
-    yield "moved by: change, in standard deviations that it has if nothing changed." if rows[1:] else ""
-    rows = [("channel", "recorded", "without a diagnosis", "effects removed or added", "unit")]
+        moved = "no information" if entry["score"] is None else f"{entry['score']:+.2g}"
+        rows.append((name, *values, shown_unit(entry["unit"]), moved, "changed" if entry["changed"] else ""))
+    yield SummaryTable(rows, "Changes since the baseline")
+    rows = [("channel", "recorded", "nominal model", "model with effects removed or added", "unit")]
     for key, made in (("removed", "without the effects"), ("added", "with the effects")):
         for channel, entry in (result.get("counterfactual") or {}).get(key, {"rmse": {}})["rmse"].items():
             sizes = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
             rows.append((channel, made, *sizes, entry["unit"]))
-    yield SummaryTable(rows, "Errors on recordings made without and with the effects")
-    yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
+    yield SummaryTable(rows, "Errors (rms) on recordings made without and with the effects")
+    yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
@@ -128,15 +124,15 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         file = Path(texts["parameter_run_folder"]) / "config.yaml"
         yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
     yield from copyable_estimates_blocks(result)
-    yield f"The diagnosis took {sum(result['seconds'].values()):.1f} s."
 
 
-def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "candidate", "parameters", "closure alone", "p", "verdict"
+def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
+    """Return table rows of the candidates that were fitted, and of the others with their forecasts."""
+    fitted: TableRows = [("effect", "parameters", "removed error", "p-value", "verdict")]
+    others: TableRows = [("effect", "forecast parameters", "p-value", "verdict")]
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
     verdicts |= {effect_entry_label(own): chosen for own in result.get("effects", ())}
-    absent = "–" * any(entry["closure"] is not None for entry in result["which"])
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
         for name, own in entry["parameters"].items():
@@ -146,9 +142,13 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
             elif value is not None:
                 shown = f"= {round(value, 12):.3g}{unit}" if entry["closure"] is None else "unknown"
                 values.append(f"{name} {shown}")
-        closed = absent if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
-        label, p = effect_entry_label(entry), p_value_text(entry["p_value"])
-        yield label, ", ".join(values), closed, p, verdicts.get(label, "")
+        label = effect_entry_label(entry)
+        ends = (p_value_text(entry["p_value"]), verdicts.get(label, ""))
+        if entry["closure"] is None:
+            others.append((label, ", ".join(values), *ends))
+        else:
+            fitted.append((label, ", ".join(values), f"{100 * entry['closure']:.3g} %", *ends))
+    return fitted, others
 
 
 @register_summary("yid-blind/1")
@@ -281,14 +281,14 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said += [] if alike is None else _history_sentences(alike)
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
-    yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
+    yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
     for (name, unit), entries in found.items():
         values = [own["value"] for own in entries if own["verdict"] in _FOUND_VERDICTS]
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), unit))
-    yield SummaryTable(spread, "Parameters over all runs")
+    yield SummaryTable(spread, "Spread of the estimates over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
@@ -296,7 +296,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str], str]) -> Iterator[Sequence[str]]:
-    yield "run", "status", "chi2/n (noise alone: 1)", "effects", *heads.values(), "time"
+    yield "run", "status", "chi2 per degree of freedom (noise alone: 1)", "effects", *heads.values(), "time"
     for entry in runs:
         cells = []
         for name, unit in heads:
@@ -330,18 +330,18 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 text = value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"])
                 cells.append("stopped" if method in stopped else text)
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, own["unit"], VERDICT_TABLE_TEXTS[own["verdict"]]))
+            rows.append((name, *cells, *others, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
     agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     objections = [*_objections_to_agreement(result, stopped)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Parameters by method", is_key_table=True)
+    yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
     costs = [entry["whitened_cost"] for name, entry in methods.items() if name not in stopped]
     best = f"The method with the lowest cost, {result['reference']}, fits best."
     if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
-        best = f"All methods fit equally well, because their costs differ by {spread:.1g} at most."
+        best = f"All methods fit equally well: their costs hardly differ ({spread:.1g} at most)."
     yield "" if result["disturbed"] else best
     for name, entry in methods.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
@@ -377,7 +377,7 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
-    yield "", *methods
+    yield "quantity", *methods
     yield "status", *(entry["status"].replace("_", " ") for entry in entries)
     costs = ("failed" if (x := entry["whitened_cost"]) is None else f"{x:.6g}" for entry in entries)
     yield "cost (half the sum of (error/noise)^2)", *costs
@@ -390,19 +390,19 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
         cells = (value_text_and_display_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
         shown = f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""
         yield f"held-out rms error of {channel}{shown}", *cells
-    yield from ((key, *(str(entry[key]) for entry in entries)) for key in ("iterations", "evaluations"))
-    for words, key in (("wall time [s]", "wall_seconds"), ("CPU time [s]", "cpu_seconds")):
-        yield words, *(f"{entry[key]:.2f}" for entry in entries)
+    yield "iterations", *(str(entry["iterations"]) for entry in entries)
+    yield "time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in entries)
 
 
 @register_summary("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    rows: TableRows = [("law", "held-out error", "± std error", f"minus that of {best}", "± of this", "unit", "note")]
+    heads = ("error", "standard error", f"difference from '{best}'", "standard error of the difference", "note")
+    rows: TableRows = [("law", *heads)]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
-        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), unit, note))
+        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), note))
     chosen = result["laws"][best]
     fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
     joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
@@ -410,25 +410,25 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    text = f"For {joints}, use the law '{best}'. Its"
+    text = f"Use the law '{best}' for these joints: {joints}. Its"
     if is_absent := bool(friction) and all(shown[name] == "–" for name in friction):
-        text = f"Use no friction law for {joints}, because these recordings do not show friction. Of '{best}', the"
-    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law within one standard "
-    text += f"error of the best. Each motion was held out in turn: {kinds}."
+        text = f"Use no friction law, because these recordings do not show friction of {joints}. Of '{best}', the"
+    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law whose error exceeds "
+    text += f"the smallest one by no more than chance allows. Each motion was held out in turn: {kinds}."
     failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
     yield SummaryStatement(text + failed, "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
-    heads = {name.rpartition(".")[2]: fitted[name]["unit"] for name in friction}
-    constants: TableRows = [("joint", *(f"{constant} [{unit}]" for constant, unit in heads.items()))]
+    symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
+    constants: TableRows = [("joint", *symbols.values())]
     for joint in result["joints"]:
         known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
-        constants.append((joint, *(known.get(constant, "") for constant in heads)))
-    yield SummaryTable(constants, f"Friction by the law '{best}'")
-    said = f"These recordings do not determine the following parameters: {lost}."
+        constants.append((joint, *(known.get(symbol, "") for symbol in symbols)))
+    yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
+    said = f"These recordings do not determine {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
-    yield SummaryTable(rows, "Friction laws", is_key_table=True)
-    others = [(name, value, fitted[name]["unit"]) for name, value in shown.items() if name not in friction]
+    yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
+    others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
     if not result["to_use"] and not is_absent:
@@ -436,30 +436,37 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from copyable_estimates_blocks(result)
 
 
+def _friction_constant_words(name: str, unit: str) -> str:
+    """Return meaning, symbol and unit of a constant of a friction law, such as `joint_coulomb@elbow.tau_c`."""
+    kind, symbol = name.partition("@")[0], name.rpartition(".")[2]
+    known = {own.name: own.description for own in EFFECTS[kind].declared_parameters} if kind in EFFECTS else {}
+    return f"{known.get(symbol, 'viscous friction')} ({symbol}) [{unit}]".removesuffix(" [1]")
+
+
 @register_summary("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = [entry["name"] for entry in result["runs"]]
-    rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p", "verdict")]
+    rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p-value", "verdict")]
     for name, entry in result["parameters"].items():
         own = entry["values"]
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
-        rows.append((name, *cells, together, entry["unit"], p, "differs" if entry["drifted"] else ""))
+        rows.append((name, *cells, together, shown_unit(entry["unit"]), p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True)
     yield from _consistency_blocks(result)
 
 
 def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    heads = "chi2 of difference from the others", "degrees of freedom", "p", "differs most in", "explained by model"
+    heads = "chi2", "expected chi2", "p-value", "differs most in", "explained by model"
     rows: TableRows = [("run", *heads, "verdict")]
     for entry in history["runs"]:
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
         rows.append((entry["name"], *apart, *verdict))
-    yield SummaryTable(rows, "Each run against the others")
-    yield "A run that agrees has a chi2 near its degrees of freedom. p: probability that noise alone differs as much."
+    yield SummaryTable(rows, "Difference of each run from the others")
+    yield "p-value: probability that noise alone causes such a difference."
 
 
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -492,21 +499,21 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 @register_summary("yid-overlay/1")
 def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     first, second = result["runs"]
-    rows: TableRows = [("parameter", first, second, "difference", "difference / std", "unit")]
+    rows: TableRows = [("parameter", first, second, "difference", "difference / larger std", "unit")]
     differing = []
     for name, entry in result["parameters"].items():
         apart, over = entry["difference"], entry["difference_in_std"]
         cells = [_overlaid_value(entry["values"].get(run)) for run in (first, second)]
         cells += ["" if size is None else f"{size:+.{digits}g}" for size, digits in ((apart, 3), (over, 2))]
-        rows.append((name, *cells, entry["unit"]))
+        rows.append((name, *cells, shown_unit(entry["unit"])))
         differing += [name] if over is not None and abs(over) > _MAX_RUN_DIFFERENCE else []
-    names = f"These parameters differ by more than {_MAX_RUN_DIFFERENCE} std: {abbreviated_names_text(differing)}."
-    none = f"No parameter differs by more than {_MAX_RUN_DIFFERENCE} std."
+    differ = f"by more than {_MAX_RUN_DIFFERENCE} standard deviations"
+    names = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
+    none = f"The two runs agree: no parameter differs {differ}."
     yield SummaryStatement(names if differing else none, "verdict")
-    yield "The std is the larger one of both runs. Both have the same data, so this is no test of significance."
     said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
     yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield SummaryTable(rows, "Estimates of both runs (± is one standard deviation)", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]
     where = f"{'held-out' if judged[0]['held_out'] else 'fitted'} recordings"
     for group, alike in grouped((entry["channel"].rpartition(".")[0], entry) for entry in judged).items():
@@ -515,12 +522,12 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         texts = [" ".join(value_text_and_display_unit(mean, alike[0]["unit"])).rstrip() for mean in means]
         text = f"On {where}, the rms error of {group} is {texts[0]} in {first} and {texts[1]} in {second}"
         yield SummaryStatement(f"{text}. The predictions of the two runs differ by {texts[2]} (rms).", "conclusion")
-    rows = [("recording", "channel (rms error)", first, second, "difference of predictions", "unit")]
+    rows = [("recording", "channel", f"error of {first}", f"error of {second}", "difference of predictions", "unit")]
     for entry in result["channels"]:
         three = (*entry["rmse"].values(), entry["difference"])
         errors = [value_text_and_display_unit(size, entry["unit"]) for size in three]
         rows.append((entry["recording"], entry["channel"], *(text for text, _ in errors), errors[0][1]))
-    yield SummaryTable(rows, "Errors of both runs, and the difference of their predictions (rms)")
+    yield SummaryTable(rows, "Errors of both runs, and difference of their predictions (rms)")
 
 
 def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
@@ -540,7 +547,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     }
     grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
     entries = (manifest["effects"] | grasps | listed).items()
-    rows: TableRows = [("part of the model", "in the file", "element of the file, or reason")]
+    rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
@@ -550,13 +557,14 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if unknown := manifest["unknown"]:
         text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has them with the values"
         yield SummaryStatement(f"{text} where the search ended. Do not rely on them.", "verdict")
-    found = {name: kinds[entry["status"]] + ", value unknown" * (name in unknown) for name, entry in entries}
-    yield SummaryTable([*rows, *((name, found[name], entry["how"]) for name, entry in entries)])
-    rows = [("replayed channel", "error (rms) with initial values", "as exported", "noise", "unit")]
+    values = dict.fromkeys(unknown, "unreliable")
+    rows += [(name, kinds[entry["status"]], values.get(name, ""), entry["how"]) for name, entry in entries]
+    yield SummaryTable(rows, "Parts of the model in the file")
+    rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
     for name, entry in gate.get("channels", {}).items():
         sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows)
+    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
 
 
 def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
@@ -571,8 +579,8 @@ def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
         yield "The file is untested, because a replay in MuJoCo has nothing to compare with the recordings."
     if worst := max(ratios, key=lambda name: ratios[name], default=""):
         is_good = ratios[worst] < _MAX_REPRODUCED_ERROR
-        text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}. The error of"
-        yield f"{text} {worst} is the largest, {ratios[worst]:.4g} times its noise (limit: {_MAX_REPRODUCED_ERROR})."
+        text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}: the largest error"
+        yield f"{text} (of {worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
         if not is_good and "joints.position" in gate["channels"]:  # arms move by their torques
             text = "Errors of recorded torques can cause this too. To exclude them, solve and export again with"
             yield f"{text} --set model.arms.mode=prescribed, which moves the arms as measured."

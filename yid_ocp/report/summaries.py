@@ -35,21 +35,23 @@ from yid_ocp.report.terminal import (
     misfit_summary_blocks,
     next_steps_table,
     register_summary,
-    torque_offset_table_rows,
+    scale_and_unit_with_metres_as_mm,
+    shown_unit,
+    torque_offset_table,
     unused_efforts_sentence,
     value_text_and_display_unit,
 )
 
 _BASELINE_DESCRIPTIONS = {
-    "stays": "every reading keeps its first value",
-    "zero": "the effort is zero",
-    "moves_with_clamps": "every point moves like the mean of the clamps that hold the cable",
-    "linear_carry": "the motion of a point is interpolated linearly between the clamps",
+    "stays": "readings do not change",
+    "zero": "efforts are zero",
+    "moves_with_clamps": "points move like the mean of the clamps",
+    "linear_carry": "points are interpolated between the clamps",
 }
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
-_MAX_ROW_NAMES_LENGTH = 40  # largest number of characters of a cell with names
+_MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
 _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
@@ -85,32 +87,31 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
-    shown, heads = "value" if converged else "last value", ("± std", "95 % interval", "unit", "verdict", "start")
-    rows: TableRows = [("parameter", shown, *heads, "bounds")]
+    heads = ("value" if converged else "last value", "± (std)", "95 % interval", "unit", "verdict", "bounds")
+    rows: TableRows = [("parameter", *heads, "meaning")]
     for name, entry in free.items():
         verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
         std = "no limit" * (verdict == "weak") if entry["std"] is None else f"{entry['std']:.2g}"
         std *= verdict not in ("", "at_bound")
         interval = _interval_cell(entry, entry["std"]) if converged else ""
-        own = ("–" if verdict == "not_identifiable" else value, std, interval, entry["unit"])
+        own = ("–" if verdict == "not_identifiable" else value, std, interval, shown_unit(entry["unit"]))
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
-        rows.append((name, *own, said, f"{entry['initial']:.4g}", bound_range_text(entry, 4)))
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
-    rows = [("fitted channel", "error (rms)", "unit", "samples")]
+        rows.append((name, *own, said, bound_range_text(entry, 4), entry.get("meaning", "")))
+    yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True)
+    rows = [("channel", "error", "unit", "samples")]
     for name, entry in result["residuals"].items():
         rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
-    yield SummaryTable(rows, "Errors on the fitted recordings")
+    yield SummaryTable(rows, "Errors (rms) on the fitted recordings")
     yield from _held_out_blocks(result)
-    yield SummaryTable(torque_offset_table_rows(result), "Constant errors of the torques")
+    yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
     yield from discretisation_shift_sentences(result)
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
-    ended = f"{status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)"
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
-    yield f"{ended}: {result['message']}" if converged else ended
+    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -148,7 +149,7 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
 
 
 def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences that compare the held-out error of a group of channels with noise and with the best baseline.
+    """Yield sentences that compare the held-out error of a group of channels with noise.
 
     A group gets one if the model does not explain the fitted data, or its error is over twice that of noise.
     """
@@ -158,19 +159,12 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
-        known = [e["baselines"] for e in entries]
-        names = [n for n in next(iter(known), {}) if all(set(channels) <= set(own.get(n, {})) for own in known)]
-        guesses = {name: _rms([own[name][c] for own in known for c in channels]) for name in names}
-        best = min(guesses, key=lambda name: guesses[name] or 0.0, default=None)
-        errors = (error, fitted, noise, guesses.get(best or ""))
-        sizes = [" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in errors]
-        guess = f" The guess that {_BASELINE_DESCRIPTIONS.get(best, best)} gives {sizes[3]}." if best else ""
         if noise is None or error is None or fitted is None:
             continue
-        is_by_torques = bool(result.get("torque_offsets")) and noise**2 > (error**2 + fitted**2) / 2
-        why = ", mostly because errors of the torques carry the arm away (chi2 accounts for this)" * is_by_torques
-        text = f"The rms error of {group} is {sizes[0]} on held-out and {sizes[1]} on fitted recordings."
-        text += f" Noise alone gives {sizes[2]}{why}.{guess}"
+        held, own, alone = (" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in (error, fitted, noise))
+        text = (
+            f"The rms error of {group} is {held} on held-out and {own} on fitted recordings; noise alone gives {alone}."
+        )
         advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
         if not result["fit"]["explains"]:
             yield text
@@ -185,27 +179,20 @@ def _rms(values: Sequence[float]) -> float | None:
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "noise alone", "unit", "guess without a model")]
-    named = list[str]()
+    named = list(dict.fromkeys(name for entry in result["held_out"] for name, own in entry["baselines"].items() if own))
+    guesses = (f"guess: {_BASELINE_DESCRIPTIONS.get(name, name)}" for name in named)
+    rows: TableRows = [("recording", "channel", "model", "noise alone", *guesses, "unit")]
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
             unit, noise = channel_or_group_unit(units, channel), entry.get("expected", {}).get(channel)
-            guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
-            named += [name for name in guesses if name not in named]
-            without = (f"{value_text_and_display_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-            error, shown = value_text_and_display_unit(entry["rmse"][channel], unit)
-            by_noise = "" if noise is None else value_text_and_display_unit(noise, unit)[0]
-            rows.append((entry["recording"], channel, error, by_noise, shown, ", ".join(without)))
-    legend = ", ".join(f"({name}) {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
+            errors = (entry["rmse"][channel], noise, *(entry["baselines"].get(name, {}).get(channel) for name in named))
+            cells = ("" if error is None else value_text_and_display_unit(error, unit)[0] for error in errors)
+            rows.append((entry["recording"], channel, *cells, scale_and_unit_with_metres_as_mm(unit)[1]))
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
-    yield SummaryTable(rows, "Errors on held-out recordings, which the fit does not use")
-    yield f"The last column has the rms error of guesses for comparison: {legend}." if legend else ""
-    moved = ", and errors of the torques that move the arm (a fit estimates them on its own recordings only)"
-    moved *= bool(result.get("torque_offsets"))
-    said = f"noise alone: the error by noise of the sensors{moved}. Up to twice this is no gap."
-    yield said if any(row[3] for row in rows[1:]) else ""
+    yield SummaryTable(rows, "Errors (rms) on held-out recordings, which the fit does not use")
+    yield "A model error up to twice that of noise alone is normal." if any(row[3] for row in rows[1:]) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -225,14 +212,16 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
     found, weak, lost = (_names_by_verdict(free)[v] for v in ("identifiable", "weak", "not_identifiable"))
     if found:
         names = abbreviated_names_text(found)
-        text = f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value"
-        text += ", or of a typical value near zero" * any(free[n]["std"] > 0.1 * abs(free[n]["value"]) for n in found)
+        text = f"{len(found)} of {len(free)} free parameters are found: their ± (one standard deviation) is at most "
+        near = ", or of a typical value near zero" * any(free[n]["std"] > 0.1 * abs(free[n]["value"]) for n in found)
+        text += f"10 % of the value{near}"
         once = f", once you have checked the issues below ({mild})" if mild else ""
-        yield f"Use these values within their ±{once}: {names}. {text}." if is_safe else f"{text}: {names}."
+        yield f"You can use these values{once}: {names}. {text}." if is_safe else f"{text} ({names})."
     if lost:
         none = "Use no value. " * (len(lost) == len(free))
         causes = [name + " (motion too weak)" * (f"parameters.{name}.free" in still) for name in lost]
-        yield f"{none}These recordings do not determine the following parameters: {abbreviated_names_text(causes)}."
+        do = "To find an experiment that does, run `yid-ocp identifiability --what-if`."
+        yield f"{none}These recordings do not determine {abbreviated_names_text(causes)}. {do}"
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
         text = f"These parameters are only weakly determined: {abbreviated_names_text(weak)}."
@@ -265,19 +254,18 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"There is nothing to analyse, because the fit ended as {result['status']} ({result['message']})."
         yield SummaryStatement(said, "verdict")
         return
-    unsure = ("± [of the value]", "± with initial state and grasps unknown too", "± with all else known")
     is_initial = result["at"] == "initial"
-    rows: TableRows = [("parameter", "value", *unsure, "95 % interval" + " of a fit" * is_initial, "unit", "verdict")]
+    rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", "95 % interval", "verdict")]
     for name, entry in parameters.items():
-        stds = [entry[key] for key in ("std_relative", "std_relative_unknown", "std_alone")]
-        spread = ("∞" if s is None else f"{100 * s:.3g} %" if s < 9.995 else "above 1000 %" for s in stds)
-        interval = _interval_cell(entry, None if is_initial or stds[0] is None else stds[0] * abs(entry["value"]))
+        std = entry["std_relative"]
+        spread = "no limit" if std is None else f"{100 * std:.3g}" if std < 9.995 else "above 1000"
+        interval = _interval_cell(entry, None if is_initial or std is None else std * abs(entry["value"]))
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
-        rows.append((name, value, *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]]))
+        rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
     verb = "are expected to be" if is_initial else "can be"
-    said = f"{len(found)} of {len(parameters)} parameters {verb} found from these recordings (± up to 10 %)"
+    said = f"{len(found)} of {len(parameters)} parameters {verb} found from these recordings (± of at most 10 %)"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
@@ -288,13 +276,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Parameters", is_key_table=True)
-    yield "The ± leave out the error of simulation (time step, number of links), which `solve` adds." * (not is_initial)
+    yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
-    doubtful = "the model does not explain the recordings" if is_poor else "a recording has a severe issue"
-    meanings = {"∞": "no upper limit is known", "open": "any value is possible", "–": "no value is determined"}
-    meanings["in doubt"] = f"{doubtful}, so the value may be wrong even if its ± is small"
-    yield " ".join(f"{word}: {text}." for word, text in meanings.items() if any(word in row for row in rows))
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
@@ -305,11 +288,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
         yield said if own != [cause] else f"{cause}."
     weak_changes = [*_weak_combined_changes(result["directions"])]
-    said = "Some parameters can be exchanged for each other: the recordings hardly show the changes of a line together "
-    said += "(one standard deviation, in % of its last value). Measure the first parameter in another way and fix it."
+    said = "Some parameters can replace each other: the recordings hardly change if all parameters of a line change "
+    said += "together, as stated in % of their values. Measure the first one in another way and fix it."
     yield said if weak_changes else ""
-    rows = [("change that the recordings hardly show",), *weak_changes[:_MAX_DIRECTIONS]]
-    yield SummaryTable(rows, "Combined changes")
+    rows = [("changes together (one standard deviation)",), *weak_changes[:_MAX_DIRECTIONS]]
+    yield SummaryTable(rows, "Changes that the recordings hardly show")
     if (left := len(hidden[_MAX_DIRECTIONS:]) + len(weak_changes[_MAX_DIRECTIONS:])) > 0:
         yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
@@ -318,14 +301,15 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         if asked["smallest"]:
             said = f"Record again with the fewest changes that determine all: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
-        rows = [("change", "parameters found", "information [nat]")]
-        yield "Information: of the recordings on all parameters. 0.7 nat more halves the ± of one parameter."
+        rows = [("change", "parameters found", "mean ± [% of that now]")]
+        now = asked["base"]["gain"]
         changes = {own["words"]: own for own in (asked["base"], *asked["smallest"], *asked["singles"])}
         for entry in changes.values():
-            gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
+            is_known = None not in (now, entry["gain"])
+            ratio = percent_number_text(math.exp((now - entry["gain"]) / len(parameters))) if is_known else ""
             count = f"{entry['identifiable']} of {len(parameters)}" if entry["gain"] is not None else "unknown"
-            rows.append((entry["words"], count, gain))
-        yield SummaryTable(rows, "What another experiment would identify")
+            rows.append((entry["words"], count, ratio))
+        yield SummaryTable(rows, "What another experiment would find (the smaller the mean ±, the better)")
         yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
@@ -366,15 +350,15 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if is_hopeless := bool(sought) and all(own["verdict"] == "not_identifiable" for own in sought):
         said = "Do not use this motion, because none of the parameters can be found from it."
     yield SummaryStatement(said, "conclusion")
-    parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
+    parts = _information_parts(result) if result["goal"] == "information" else _place_parts(result)
     yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
-    rows: TableRows = [("joint", "travel [rad or m]", "largest velocity / limit", "largest effort / limit")]
+    rows: TableRows = [("joint", "travel [rad, or m]", "largest speed [% of limit]", "largest effort [% of limit]")]
     for name, own in result["joints"].items():
         travel = own["travel"] if own["travel"] > 1e-9 else 0.0
-        shares = ("" if own[key] is None else f"{percent_number_text(own[key])} %" for key in ("velocity", "effort"))
+        shares = ("" if own[key] is None else percent_number_text(own[key]) for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
-    yield SummaryTable(rows, "Load of the joints", is_key_table=True)
-    steps = {"plan with the estimates of solve (RUN: its folder)": "plan --set plan.parameter_run_folder=RUN"}
+    yield SummaryTable(rows, "Motion and effort of the joints", is_key_table=True)
+    steps = {"plan with estimated values (RUN: run folder of solve)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
@@ -384,35 +368,36 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield next_steps_table(result, longer if not is_usable and said != done else steps)
 
 
-def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["error"] is None or result["swing"] is None:
         yield "Do not use this motion, because the model cannot simulate it to its end."
         return
-    place, asked = ", ".join(f"{x:.4g}" for x in result["place"]), 1e3 * result["tolerance"]
-    yield (
-        f"The target of the point '{result['point']}' after {result['duration']:g} s is ({place}) m in the world. In "
-        f"the model it stays within {1e3 * result['error']:.3g} mm of it for the next {result['settle']:g} s "
-        f"(position_tolerance: {asked:g} mm). No point of the object is then faster than "
-        f"{1e3 * result['swing']:.3g} mm/s (point_rest_speed_tolerance: {1e3 * result['speed_tolerance']:g} mm/s)."
-    )
+    place, limit = ", ".join(f"{x:.4g}" for x in result["place"]), f"{1e3 * result['tolerance']:g}"
+    near = (limit, "position_tolerance", "mm")
+    yield f"The point '{result['point']}' has the target ({place}) m in the world after {result['duration']:g} s."
+    fastest = (f"{1e3 * result['speed_tolerance']:g}", "point_rest_speed_tolerance", "mm/s")
+    rows: TableRows = [("quantity", "predicted", "limit", "setting of the limit", "unit")]
+    rows.append(("largest distance of the point from the target", f"{1e3 * result['error']:.3g}", *near))
+    rows.append(("largest speed of any point of the object", f"{1e3 * result['swing']:.3g}", *fastest))
     if result["off_path"] is not None:
-        yield f"During the motion it is at most {1e3 * result['off_path']:.3g} mm from the path through its waypoints."
+        rows.append(("largest distance from the path, before", f"{1e3 * result['off_path']:.3g}", "", "", "mm"))
+    for axis, std in zip("xyz", result["std"] or (), strict=False):
+        rows.append((f"std of the position in {axis}, from uncertain parameters", f"{1e3 * std:.2g}", *near))
+    yield SummaryTable(rows, f"Prediction of the model for the {result['settle']:g} s after the motion")
     if result["std"] is not None:
-        std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
-        known = f"(one standard deviation; position_tolerance: {asked:g} mm)"
-        miss = " So the real object may miss the place." * (1e3 * max(result["std"]) > asked)
-        yield f"Uncertain parameters make this position uncertain by ({std}) mm in x, y, z {known}.{miss}"
+        miss = "The real object may miss the target, because the parameters are too uncertain."
+        yield miss if max(result["std"]) > result["tolerance"] else ""
         if lost := result["from"]["uncertainty_unknown"]:
             yield f"This ignores parameters whose uncertainty is unknown: {', '.join(lost)}."
     elif result["from"]["run"] is None:
-        yield "The uncertainty of the position is unknown, because the plan uses initial values, not estimates."
+        yield "The real object may miss the target, because the plan uses initial values, not estimates."
 
 
 def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
-        cells = ("unknown" if std is None else f"± {percent_number_text(std)} %" for std in stds)
+        cells = ("unknown" if std is None else f"{percent_number_text(std)} %" for std in stds)
         rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     found = [name for name, own in result["parameters"].items() if own["verdict"] == "identifiable"]
     count, names = f"{len(found)} of {len(result['parameters'])} parameters", abbreviated_names_text(found)
@@ -421,12 +406,12 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     small = {name for name, own in result["parameters"].items() if (own["std_relative_together"] or 1.0) <= 0.1}
     more = abbreviated_names_text(sorted(small.difference(found)))
     both = f" Together with the existing recordings, it would also determine {more}." if more else ""
-    yield f"A recording of this motion {said}.{both} The table has the expected ±."
-    yield SummaryTable(rows, "Expected precision")
-    rows = [("effect", "compared with", "difference in the recordings", "difference in this motion")]
+    yield f"A recording of this motion {said}.{both}"
+    yield SummaryTable(rows, "Expected standard deviation, in % of the value")
+    rows = [("effect", "compared with", "difference in the recordings / noise", "difference in this motion / noise")]
     for own in result["distances"]:
-        rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
-    yield SummaryTable(rows, "Effects")
+        rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g}" for when in ("before", "after"))))
+    yield SummaryTable(rows, "How well two effects can be told apart")
     reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
     yield f"The motion reaches {text}."
@@ -453,28 +438,37 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    yield f"Pinocchio gives the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
-    rows: TableRows = [("recording", "use", "group", "samples", "rate", "longest gap", "typical noise std")]
+    yield f"Pinocchio confirms the mass matrix, weight and inverse dynamics of {agreed}." if agreed else ""
+    rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
+    noise = dict[Sequence[str], list[str]]()  # names of the recordings by noise of a channel
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
     for entry in result["recordings"]:
         use = "held out" if entry["role"] == "held_out" else "estimate"
         for name, group in entry["groups"].items():
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
-            rows.append((entry["recording"], use, name, *taken, _noise_words(entry["noise"], name)))
+            rows.append((entry["recording"], use, name, *taken))
+        for cells in _noise_cells(entry["noise"]):
+            noise.setdefault(cells, []).append(entry["recording"])
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
         apart.setdefault(", ".join(gaps), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
+    rows = [("channel", "noise (std)", "constant error (std)", "source", "recordings")]
+    rows += [(*cells, ", ".join(own) * (len(own) < len(result["recordings"]))) for cells, own in noise.items()]
+    yield SummaryTable(rows, "Noise of the readings")
     share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
-    yield f"The noise is {share:g} of the std in a fit (diagnosis.noise_fraction_of_stated_std)." if share < 1 else ""
+    said = f"A fit assumes {1 / share:.3g} times this std for model error (diagnosis.noise_fraction_of_stated_std)."
+    yield said if share < 1 else ""
     told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
     yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
     for key, head in (("links", "links"), ("time_step", "time step [s]")):
-        rows = [(head, "lowest natural frequencies [Hz]", "remark")]
+        count = max((len(row["hertz"]) for row in convergence[key]), default=0)
+        rows = [(head, *(f"mode {i + 1}" for i in range(count)), "remark")]
         for row in convergence[key]:
-            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), row["message"]))
-        yield SummaryTable(rows, f"Frequencies by {head}")
-    yield f"Natural frequencies: {convergence['message']}." if convergence["message"] else ""
+            hertz = [f"{f:.4g}" for f in row["hertz"]]
+            rows.append((f"{row['value']:g}", *hertz, *[""] * (count - len(hertz)), row["message"]))
+        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] by {head}")
+    yield f"Natural frequencies were {convergence['message']}." if convergence["message"] else ""
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
     yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
@@ -483,22 +477,17 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
-    yield "`solve` tests how links and time step change its estimates." if result["recordings"] else ""
     step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] and not severe else {})
 
 
-def _noise_words(noise: Mapping[str, Any], name: str) -> str:
-    """Return the noise of a recorded group, or of each of its channels, with the expected offset, as text."""
-    said = []
-    for part in ("", ".effort", ".position"):
-        known = noise.get(f"{name}{part}")
-        if known is not None and known["std"] is not None:
-            words = " ".join(value_text_and_display_unit(known["std"], known["unit"]))
-            offset = " ".join(value_text_and_display_unit(known.get("bias_std"), known["unit"]))
-            words += f" (unknown offset: ± {offset})" if known.get("bias_std") else ""
-            said.append(f"{part[1:]} {words}".strip() + (" (estimated)" if known.get("estimated") else ""))
-    return "; ".join(said)
+def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    """Yield channel, std of its noise, std of a constant error and source of the noise, as table cells."""
+    for channel, known in noise.items():
+        std, offset = (" ".join(value_text_and_display_unit(known.get(k), known["unit"])) for k in ("std", "bias_std"))
+        source = "estimated" if known.get("estimated") else "stated"
+        if known["std"] is not None:
+            yield channel, std, offset * bool(known.get("bias_std")), source
 
 
 @register_summary("yid-inspect/1")
@@ -521,43 +510,41 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
     said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
-    seconds = max((entry["seconds"] for entry in result["dependence"].values()), default=0.0)
-    one = f" One reading: the largest change of a single reading within {seconds:.2g} s from equilibrium."
-    text = "All readings: how much all readings together change with the parameter (by its `change`), in standard "
-    yield f"{text}deviations of their noise ({_MIN_VISIBLE_CHANGE} or more is visible).{one * (seconds > 0)}"
-    text = "Equations: those of a time step that contain the parameter (del: motion of a coordinate, p1: its momentum "
-    yield f"{text}after the step). Observed: those of them that change a reading."
-    yield SummaryTable([*_dependence_rows(result)], "Equations and sensors of the parameters", is_key_table=True)
-    if any(own["seen"] is None and result["parameters"][name]["free"] for name, own in result["dependence"].items()):
-        yield "Which of the equations sensors observe is computed only for recordings that start in equilibrium."
-    rows: TableRows = [("parameter", "value", "unit", "bounds", "use")]
+    rows, equations = _dependence_rows(result)
+    yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
+    yield SummaryTable(equations, "Equations that contain the parameter", is_page_only=not result["asked"])
+    rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
     for name in result["asked"] or result["parameters"]:
         entry = result["parameters"][name]
-        bounds, use = bound_range_text(entry, 6), "free" if entry["free"] else "fixed"
-        rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, use))
-    yield SummaryTable(rows, "Parameters")
+        cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
+        rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
+    yield SummaryTable(rows, "All parameters")
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
     files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
-    yield f"The folder has equations.txt (all equations and names), {files}."
+    yield f"The folder has equations.txt (all equations and their names), {files}."
     yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
 
 
-def _dependence_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield the equations with each named (else each free) parameter, and how its change changes the readings."""
+def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
+    """Return how a change of each named (else each free) parameter changes the readings, and the equations with it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
-    yield "parameter", "change", "all readings [std]", "one reading [std]", "best sensor", "equations", "observed"
+    moved: TableRows = [("parameter", "change", "effect on all readings / noise", "visible", "most sensitive sensor")]
+    equations: TableRows = [("parameter", "equations", "observed by sensors", "change of one reading / noise")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
         observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else observed
         moves, small = [own[key] and own[key] * change for key in ("along", "moved")], f"< {_NEGLIGIBLE_STDS:g}"
-        sizes = ["" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves]
-        yield name, f"{change:.3g} {own['unit']}", *sizes, own["best"], _row_names_text(rows), sight
+        along, one = ("" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
+        is_visible = "" if moves[0] is None else "yes" if moves[0] >= _MIN_VISIBLE_CHANGE else "no"
+        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, own["best"]))
+        equations.append((name, _row_names_text(rows), sight, one))
+    return moved, equations
 
 
 def _shown_change(parameter: Mapping[str, Any]) -> float:
@@ -580,9 +567,9 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
     yield SummaryStatement(said, "verdict")
     rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-    yield SummaryTable([("group of channels", "samples"), *rows], "Recorded", is_key_table=True)
+    yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
     option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
-    yield next_steps_table(result, {"estimate from it": f"solve --set {shlex.quote(option)}"})
+    yield next_steps_table(result, {"estimate parameters from this recording": f"solve --set {shlex.quote(option)}"})
 
 
 @register_summary("yid-track/1")
@@ -598,7 +585,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
     used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
     yield SummaryStatement(result["refused"] or used, "verdict")
-    yield SummaryTable(rows, "Points", is_key_table=True)
+    yield SummaryTable(rows, "Tracked points", is_key_table=True)
     for why, n in result["dropped"].items():
         of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
         first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)

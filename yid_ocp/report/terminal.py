@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
-from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
+from yid_ocp.display import abbreviated_names_text, grouped
 from yid_ocp.inference import uncertainty
 from yid_ocp.sensors.base import channel_specs_for_group_name
 
@@ -24,13 +24,11 @@ if TYPE_CHECKING:
 
 TableRows = list[Sequence[str]]
 _MAX_REMEDIES_PER_CAUSE = 3
-_MAX_OFFSET_RECORDINGS = 4  # recordings that a table of torque offsets shows side by side
 _MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
-_PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
-"""Widths to which sentences and notes are wrapped, and largest length of a note that stays on one line."""
+_PROSE_WIDTH = 100  # width to which sentences are wrapped
 
 
 @dataclass(frozen=True)
@@ -96,6 +94,11 @@ def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
+def shown_unit(unit: str) -> str:
+    """Return a unit for a table cell: a dash for numbers without unit."""
+    return "–" if unit == "1" else unit
+
+
 def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, str]:
     """Return the value of an error as text (a dash for None), and the unit in which it is displayed."""
     factor, shown = scale_and_unit_with_metres_as_mm(unit)
@@ -138,7 +141,7 @@ def next_steps_table(result: Mapping[str, Any], steps: Mapping[str, str]) -> Sum
     """Return a table of command lines for the configuration of a result, from commands and options by purpose."""
     words = shlex.split(result.get("command", "yid-ocp solve CONFIG"))[2:3]
     config = shlex.join(word for word in words if not word.startswith("--"))
-    rows: TableRows = [("next step", "command")]
+    rows: TableRows = [("purpose", "command")]
     for purpose, text in steps.items():
         command, _, options = text.partition(" ")
         rows.append((purpose, " ".join(filter(None, ("yid-ocp", command, config, options)))))
@@ -154,13 +157,15 @@ def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield the found values of a result to copy, as text, YAML, MJCF and LaTeX. Nothing if none is found."""
     if use := result.get("to_use"):
-        left_out = " and ".join(use["uncounted_errors"])
-        stated = f"± is one standard deviation{f', without the error {left_out}' if left_out else ''}"
+        ignored = " and ".join(use["uncounted_errors"])
+        yield f"Values to use (± is one standard deviation{f', without the error {ignored}' if ignored else ''}):"
+        yield CodeBlock("\n".join(use["values"]))
         lost = abbreviated_names_text(use.get("left_out", ()))
-        stated += f"; left out as too uncertain: {lost}" * bool(lost)
-        yield f"To use these numbers, copy the lines below, as text, YAML, MJCF or LaTeX ({stated}):"
-        lines = [*use["values"], *use["yaml"], *use["mjcf"], *use["latex"], use["export"], f"cite: {use['cite']}"]
-        yield CodeBlock("\n".join(lines))
+        yield f"Too uncertain, so not listed: {lost}." if lost else ""
+        kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
+        for words, lines in (kinds | {"a model file": [use["export"]], "a citation": [use["cite"]]}).items():
+            yield f"For {words}:" if lines else ""
+            yield CodeBlock("\n".join(lines))
 
 
 def misfit_summary_blocks(
@@ -202,7 +207,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
     estimates = {name: f"estimate: {own['value']:.4g} " for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
-    kinds["encoder_noise"] = "the noise of joint angles (sensors.joints.position.std) added a second time"
+    kinds["encoder_noise"] = "additional noise of the joint angles (sensors.joints.position.std)"
     quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
     found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
@@ -211,13 +216,14 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         worst = sorted(moved.items(), key=lambda item: -abs(item[1][key]) / item[1]["std"])
         changes = [f"{n} by {e[key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {e['std']:.2g})" for n, e in worst]
         if moved:
-            text = f"With {words}, these estimates would change by more than their ± from the data: "
+            text = f"{words.capitalize()} would change these estimates by more than their ± from noise: "
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
             said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The ± of the table includes this.")
         elif tried:
             quiet.append(words)
     if quiet:
-        said.append(f"With {', or with '.join(quiet)}, no estimate would change by more than its ± from the data.")
+        tried_words, what = " or ".join(quiet), "" if said else ", so the simulation is accurate enough"
+        said.append(f"{tried_words.capitalize()} would change no estimate by more than its ± from noise{what}.")
     return said + ([f"To reduce these errors, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 
@@ -229,19 +235,16 @@ def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
     return said + "into account. Check the calibration of the torque sensor." if large else ""
 
 
-def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
-    """Return table rows of a result's torque offsets, one for each joint; only the header if there are none."""
-    offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
-    shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
-    rows: TableRows = [("estimated torque offset [N m]", *shown, "expected size")]
+def torque_offset_table(result: Mapping[str, Any]) -> SummaryTable:
+    """Return a table of a result's torque offsets, with a row for each joint, for the page only."""
+    shown: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
+    rows: TableRows = [("joint", *shown, "expected size")]
     for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
         own = [entry.get(joint) for entry in shown.values()]
         cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
         priors = dict.fromkeys(f"± {known['prior_std']:.2g}" for known in own if known is not None)
         rows.append((joint, *cells, ", ".join(priors)))
-    left = len(offsets) - len(shown)
-    rows += [(f"result.json has {count_with_noun(left, 'more recording')}", *("" for _ in shown), "")] if left else []
-    return rows
+    return SummaryTable(rows, "Estimated constant errors of the torques [N m]", is_page_only=True)
 
 
 def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
@@ -256,16 +259,12 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
-            space = [""] if result and result[-1] else []
-            result += [] if block.is_page_only else [*space, *aligned_table_lines(block.rows), ""]
+            above = [""] * bool(result and result[-1]) + [f"{block.title}:"] * bool(block.title)
+            result += [] if block.is_page_only else [*above, *aligned_table_lines(block.rows), ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
-        elif block.text.endswith("."):
-            result += textwrap.wrap(block.text, _PROSE_WIDTH, break_on_hyphens=False)
-        elif len(block.text) > _MAX_UNWRAPPED_NOTE:
-            result += textwrap.wrap(block.text, _NOTE_WIDTH, subsequent_indent="  ")
         else:
-            result.append(block.text)
+            result += textwrap.wrap(block.text, _PROSE_WIDTH, break_on_hyphens=False)
     return result[:-1] if result and not result[-1] else result
 
 

@@ -29,6 +29,7 @@ from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
 from yid_ocp.report.animation import measured_motion_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
+from yid_ocp.report.terminal import TableRows, aligned_table_lines
 from yid_ocp.version import package_version
 from yid_ocp.workflow import import_recording
 from yid_ocp.workflow.build import build_system
@@ -190,16 +191,16 @@ def _summary_lines(
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
-    carried = "object" if proposal.has_object else "payload, which is estimated (as no --object is given)"
-    lines = [
-        f"model.arms.joints: {abbreviated_names_text(proposal.joints, math.inf)}",
-        f"frame that holds the {carried}: {', '.join(held)}"
-        + f" (other frames for --holder: {', '.join(others)})" * bool(others),
-        f"model.arms.mode: {proposal.arm_mode} ({proposal.arm_mode_reason})",
-        f"problem.initial_state: {proposal.initial_state} ({proposal.initial_state_reason})",
+    carried = "object" if proposal.has_object else "payload (estimated, as no --object is given)"
+    rows: TableRows = [
+        ("setting", "choice", "reason, or other choices"),
+        ("model.arms.joints", abbreviated_names_text(proposal.joints, math.inf), ""),
+        (f"frame of the {carried}", ", ".join(held), f"other choices for --holder: {', '.join(others)}" * bool(others)),
+        ("model.arms.mode", proposal.arm_mode, proposal.arm_mode_reason),
+        ("problem.initial_state", proposal.initial_state, proposal.initial_state_reason),
+        ("model.damping", f"{_value(proposal.urdf_joint_damping)} N m s/rad", "as the robot file states"),
     ]
-    damping = _value(proposal.urdf_joint_damping)
-    lines += [f"model.damping: {damping} N m s/rad, as the robot file states"] * bool(proposal.urdf_joint_damping)
+    lines = aligned_table_lines(rows if proposal.urdf_joint_damping else rows[:-1])
     told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
     lost = [f"warning: {text}" for text in told if "`init` leaves out" in text]
     for group, own in proposal.point_placements.items() if proposal.has_object else ():

@@ -126,11 +126,12 @@ def solution_to_result_dict(
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, _, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
+    meanings = {own.name: own.description for own in problem.system.parameters}
     return {
         "format": "yid-solve/1",
         "status": solution.status.value,
         "message": solution.message,
-        "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},
+        "parameters": {n: asdict(e) | {"meaning": meanings[n.split("[")[0]]} for n, e in solution.parameters.items()},
         "cost": solution.cost,
         "iterations": solution.n_iterations,
         "evaluations": solution.n_evaluations,
