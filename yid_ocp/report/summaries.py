@@ -161,10 +161,15 @@ def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         error, noise = map(_rms, told)
         if noise is None or error is None or fitted is None:
             continue
-        held, own, alone = (" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in (error, fitted, noise))
+        known = [entry["baselines"] for entry in entries]
+        names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
+        best = min((_rms([own[n][c] for own in known for c in channels]) or 0.0 for n in names), default=None)
+        sizes = error, fitted, noise, best
+        held, own, alone, guess = (" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in sizes)
         text = (
-            f"The rms error of {group} is {held} on held-out and {own} on fitted recordings; noise alone gives {alone}."
+            f"The rms error of {group} is {held} on held-out and {own} on fitted recordings. Noise alone gives {alone}"
         )
+        text += f", the best guess without a model {guess}." if guess else "."
         advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
         if not result["fit"]["explains"]:
             yield text
@@ -192,7 +197,11 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors (rms) on held-out recordings, which the fit does not use")
-    yield "A model error up to twice that of noise alone is normal." if any(row[3] for row in rows[1:]) else ""
+    said = "A model error up to twice that of noise alone is normal."
+    said += " Noise alone includes errors of the torques, which carry the arm away." * bool(
+        result.get("torque_offsets")
+    )
+    yield said if any(row[3] for row in rows[1:]) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
