@@ -214,7 +214,7 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise
     except Exception as error:  # a malformed file raises many kinds
         reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
-        allowed, hint = "a URDF file with links and joints", "give it before recordings; if damaged, run `check_urdf`"
+        allowed, hint = "a URDF file with links and joints", f"find the place by `check_urdf {file}`, and correct it"
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 

@@ -72,6 +72,9 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
         raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
+    if source.suffix in (".yaml", ".yml"):
+        what, hint = f"{source.name} is a configuration", f"give the run folder that `yid-ocp solve {source}` makes"
+        raise ConfigError(what, where=str(source), allowed="a recording (.h5), or a run folder", hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts: list[str] = []
     if source.is_dir():
@@ -158,8 +161,8 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         what, hint = f"a run cannot be exported as '{form}'", f"write --format mjcf (model) or mcap (signals){why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if out.is_file():
-        what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
-        raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
+        what, hint = f"{out.name} already exists, and `export` overwrites nothing", "choose another --out, or remove it"
+        raise OutputError(what, where=str(out), allowed="a file that does not exist yet", hint=hint)
     progress.begin_stage("building the model")
     full, unknown = calibrated.system(), [n for n, std in calibrated.parameter_stds.items() if std is None]
     if form == "yaml":

@@ -49,7 +49,7 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
 
     Raises `DataError` without a finished run, or for a result that is unreadable, old, of another command, or failed.
     """
-    file, result = Path(folder) / "result.json", read_estimation_result(folder)
+    file, result = Path(folder) / "result.json", _read_converged_result(folder)
     again = f"repeat the run with this version: {result.get('command', 'the command of this folder')}"
     try:
         said = result.get("model", result)  # of a diagnosis, the final model
@@ -70,8 +70,9 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
         raise DataError(what, where=str(file), allowed=allowed, hint=again) from error
     if not names:
-        what, hint = "the run has found no parameter", "use a run that has found a parameter"
-        raise DataError(what, where=str(file), allowed="one parameter or more with a standard deviation", hint=hint)
+        what, allowed = "the run has found no parameter", "a run in which one free parameter or more can be found"
+        hint = "leave this run out; `yid-ocp identifiability` shows which recordings would determine its parameters"
+        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)
@@ -107,6 +108,16 @@ def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve
     if result.get("status") == "failed":
         what, hint = f"the run in this folder failed: {result.get('message')}", "give the folder of a successful run"
         raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
+    return result
+
+
+def _read_converged_result(folder: str | Path) -> dict[str, Any]:
+    """Read result.json as `read_estimation_result` does. Raises `DataError` if the fit did not converge."""
+    result = read_estimation_result(folder)
+    if result.get("status") == "iteration_limit":  # standard deviations hold at a minimum only
+        what, allowed = "the fit of this run did not converge, so its values are not estimates", "a run that converged"
+        hint = f"repeat the run: {result.get('message', 'increase solver.max_iterations')}"
+        raise DataError(what, where=str(Path(folder) / "result.json"), allowed=allowed, hint=hint)
     return result
 
 
@@ -328,7 +339,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     """Overlay two runs of the same recordings and write `overlay.json` and report.html."""
     progress.begin_stage("overlaying the predictions of both runs")
     labels = [folder.name if folders[0].name != folders[1].name else str(folder) for folder in folders]
-    results, roles = [read_estimation_result(folder) for folder in folders], dict[str, list[str]]()
+    results, roles = [_read_converged_result(folder) for folder in folders], dict[str, list[str]]()
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -171,7 +172,11 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
 def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     if is_file(file):
         return file
-    hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
+    folder = Path(run.config_file).resolve().parent
+    here = Path(os.path.relpath(file, folder))  # the path as written, which may be meant from the working directory
+    hint = f"write {os.path.relpath(here, folder)}: paths are relative to the folder of the configuration file"
+    if not is_file(here):
+        hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 

@@ -79,6 +79,10 @@ def _format_of(path: Path) -> str:
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ... (robots: `init`)"
-        raise DataError(what, where=str(path), **unknown_name_error_arguments(key.replace(".urdf", ""), READERS, hint))
+        what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ..."
+        said = unknown_name_error_arguments(key, READERS, hint)
+        if key in (".urdf", ".xml"):
+            what = "this is a robot, not a recording"
+            said["hint"] = f"give a recording here. The robot belongs to: yid-ocp init {path} RECORDING.h5"
+        raise DataError(what, where=str(path), **said)
     return key
