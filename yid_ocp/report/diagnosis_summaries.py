@@ -128,7 +128,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         file = Path(texts["parameter_run_folder"]) / "config.yaml"
         yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
     yield from copyable_estimates_blocks(result)
-    yield f"The diagnosis took {sum(result['seconds'].values()):.1f} s."
+    yield f"The diagnosis took {sum(result['seconds'].values()):.1f} s, without building the model and the report."
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:

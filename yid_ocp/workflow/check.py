@@ -69,6 +69,8 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
         is_refused = run.recordings.stop_on_any_issue and bool(warnings or convergence["warnings"])
+        issues = () if problem is None else problem.options.data_issues
+        is_unusable = is_refused or any(issue.severity != "warning" for issue in issues)  # `check` says not to solve
         result = {
             "format": "yid-check/1",
             "refused": is_refused,
@@ -76,11 +78,11 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "mechanics": mechanics,
             "recordings": recordings,
             "convergence": convergence,
-            "issues": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
+            "issues": issues_to_plain_data(issues),
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandOutcome(folder.path, written, None, not is_refused)
+    return CommandOutcome(folder.path, written, None, not is_unusable)
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:

@@ -72,7 +72,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
     found, said = list[dict[str, Any]](), list[str]()
     for file in arguments.files:
         with stderr_progress_display(arguments) as progress:
-            progress.begin_stage(f"reading {file}")
+            progress.begin_stage(f"listing the contents of {file}")
             contents = preview_file(file, progress)
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
             sources = [attributes_to_dict(own, keys) for own in contents.sources]

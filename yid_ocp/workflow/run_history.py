@@ -260,10 +260,8 @@ def require_recordings_not_in_baseline(
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
-            where, hint = (
-                ("diagnosis", "baseline_run_folders"),
-                "leave it out of `recordings`, or choose another baseline",
-            )
+            where = ("diagnosis", "baseline_run_folders")
+            hint = "leave it out of `recordings`, or choose another baseline"
             what = f"the recording {episode.name} would count twice, because the baseline has it too"
             if not runs or run.recordings.without_effect:
                 where, hint = ("recordings", "without_effect"), "remove it from one of the two lists"

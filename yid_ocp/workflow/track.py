@@ -62,7 +62,7 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
                 issues = [] if recording is None else data_quality_issues_of_recording(run, system, recording)
-                progress.begin_stage("finding what all images share: camera, clock and dimensions")
+                progress.begin_stage("finding what all images share: camera, clock and dimensions (can take minutes)")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("fitting the object in every image")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
