@@ -339,9 +339,8 @@ class _Parser(argparse.ArgumentParser):
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
         where, allowed, hint = self.prog, self._usage(), self._help()
         if lacking := re.fullmatch(r"the following arguments are required: (.*)", message):
-            named = {(*own.option_strings, str(own.metavar))[0]: own.help for own in self._needed()}
-            words = [name + f" ({named[name]})" * bool(named.get(name)) for name in lacking[1].split(", ")]
-            hint = f"add {', '.join(words)}; {hint}"
+            about = {(*own.option_strings, own.metavar)[0]: f" ({own.help})" for own in self._needed() if own.help}
+            hint = f"add {', '.join(name + about.get(name, '') for name in lacking[1].split(', '))}; {hint}"
         if wrong := re.fullmatch(r"argument (\S+): invalid (\w+) value: (.*)", message, re.DOTALL):
             allowed, where = {"int": "a whole number", "float": "a number"}[wrong[2]], f"{self.prog} {wrong[1]}"
             message = f"{wrong[1]} is {wrong[3]}, but must be {allowed}"

@@ -42,8 +42,6 @@ _YAML_FAULTS = {  # what the parser says: in plain words, and the cure
     "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
     "cannot start any token": ("a tab, or a character that needs quotes", "indent by spaces, and quote such text"),
     "could not find expected ':'": ("a key without a colon", "write KEY: VALUE, with a space after the colon"),
-    "expected ',' or": ("a bracket without its partner", "close each [ by ] and each { by }"),
-    "while scanning a quoted": ("a quotation mark without its partner", "close the quotation marks"),
 }
 
 
@@ -298,7 +296,9 @@ class _Reader:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.options_of_variant(sections.default_variant))
-            what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
+            name, what = self._name(path), f"{self._name(path)} = {_shown(raw)} is not a section"
+            near = difflib.get_close_matches(name.rpartition(".")[2], keys, 1, 0.65)
+            hint = f"did you mean '{near[0]}'?" if near else f"add a key, as in {name}.{keys[0]}"
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.read_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
@@ -324,12 +324,10 @@ class _Reader:
         unit = schema.option_info_from_annotation(hint).unit
         advice = options.default_value_hint(self._name(path), options.Option(hint, default))
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
-            given, factor = match[2].strip(), _FACTORS.get((match[2].strip(), unit), 0.0)
-            factor = 1.0 if given == unit else factor
-            number = f"{float(match[1]) * factor:.6g}" if factor and match[1].count(".") < 2 else ""
-            advice = f"write {number or 'the number'} alone, without a unit" + f": it is in {unit}" * bool(unit)
-            if unit and not factor:
-                advice += f", so convert it from {given}"
+            given = match[2].strip()
+            factor = 1.0 if given == unit else _FACTORS.get((given, unit), 0.0) if match[1].count(".") < 2 else 0.0
+            number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
+            advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
         lists = map(options.variadic_tuple_entry_type, options.non_none_union_members(hint))
         if isinstance(raw, (dict, str)) and any(entry is not None for entry in lists):
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
@@ -347,13 +345,6 @@ class _Reader:
     @staticmethod
     def _name(path: _KeyPath) -> str:
         return ".".join(map(str, path)) or "the configuration"
-
-
-def _key_meant(name: str, keys: Sequence[str]) -> str:
-    """Return a suggested key if the last part of `name` is missing or misspelt. Names of users may contain dots."""
-    within, _, last = name.rpartition(".")
-    close = difflib.get_close_matches(last, keys, n=1, cutoff=0.65)
-    return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"
 
 
 _adapter = functools.cache(TypeAdapter)

@@ -448,9 +448,7 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
     found, waiting, links = set[str](), list(excluded), [link.name for link in robot.links]
     while waiting:
         link = waiting.pop()
-        if link not in links:
-            what, otherwise = f"there is no link '{link}' to leave out", f"remove '{link}' from exclude_links"
-            raise ModelError(what, where=where, **unknown_name_error_arguments(link, links, otherwise))
+        require_known_names([link], links, "link", f"{where}: exclude_links", ModelError)
         found.add(link)
         waiting += [joint.child for joint in robot.joints if joint.parent == link]
     return found

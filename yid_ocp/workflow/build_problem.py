@@ -219,11 +219,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
         constants = next((c.constants for c in channel_specs_for_group_name(group) if c.quantity == quantity), {})
-        for constant in said.constants:
-            if constant not in constants:
-                details = unknown_name_error_arguments(constant, constants)
-                what = f"'{name}' has no constant '{constant}'"
-                raise run.config_error(what, "sensors", name, "constants", **details)
+        check_names_in_setting(run, "constant", said.constants, constants, "sensors", name, "constants")
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:

@@ -72,9 +72,6 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
         raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
-    if source.suffix in (".yaml", ".yml"):
-        what, hint = f"{source.name} is a configuration", f"give the run folder that `yid-ocp solve {source}` makes"
-        raise ConfigError(what, where=str(source), allowed="a recording (.h5), or a run folder", hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts: list[str] = []
     if source.is_dir():

@@ -401,10 +401,8 @@ def _meanings(
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given:
-            allowed = (
-                "a name such as t, q_<joint>, velocity_<joint>, effort_<joint>, position_command_<joint>, <point>_x "
-            )
-            allowed += "or <link>_force_x, then the unit if it is not SI, such as [deg]"
+            allowed = "a name such as t, q_<joint>, velocity_<joint>, effort_<joint>, position_command_<joint>, "
+            allowed += "<point>_x or <link>_force_x, then the unit if it is not SI, such as [deg]"
             meaning = f"'{name}=position:JOINT'"
             if "current" in name.lower():
                 meaning = f"'{name}=effort:JOINT' --units effort=A --torque-constants JOINT=N_M_PER_A"
@@ -447,9 +445,9 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     for meaning in wanted:
         if meaning not in places:
             what, skip = f"the table has no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
-            allowed = "a position for every joint, and every other channel for all joints or none"
-            allowed = "x, y and z for every point and sensor" if meaning[0][-1] in AXES else allowed
-            rest = "other axes" if meaning[0][-1] in AXES else "same channel of other joints"
+            allowed, rest = "every channel for all joints, with their position", "same channel of other joints"
+            if meaning[0][-1] in AXES:
+                allowed, rest = "x, y and z for every point and sensor", "other axes"
             hint = f"add the column, or leave out the columns of the {rest}: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column
             lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]
