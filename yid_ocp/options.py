@@ -135,7 +135,7 @@ def _words(hint: Any) -> str:
     if mapping_value_type(bare) is not None:
         choices = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
         if names := [name for own in choices for name in own.registry]:
-            return f"a section, such as {{{names[0]}: {{}}}}, for each name among {', '.join(names)}"
+            return f"a section, such as {{{names[0]}: {{}}}}, with names among {', '.join(names)}"
         value = _words(mapping_value_type(bare))
         return f"a section that has for each name {value}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
