@@ -100,7 +100,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
         ("model:\n  grasp: [left]\n", ["model.grasp"]),
         ("model:\n  gravity: [0, 0]\n", ["a list of 3", "[0.0, 0.0, -9.81] (the default)"]),
-        ("model:\n  arms: {joints: left_s0}\n", ["a list"]),
+        ("model:\n  arms: {joints: left_s0}\n", ["a list of text", 'one entry: ["left_s0"]']),
         ("problem:\n  duration: true\n", ["a number"]),
         ("problem:\n  time_step: '0.01'\n", ["a number"]),
         ("problem:\n  arm_proportional_gains: []\n", ["problem.arm_proportional_gains"]),
