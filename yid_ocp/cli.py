@@ -324,8 +324,8 @@ class _Parser(argparse.ArgumentParser):
         if rest:
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
             if not flag.startswith("-"):
-                what, allowed = f"'{rest[0]}' is one argument too many", "the arguments that --help lists"
-                raise ConfigError(what, where=self.prog, allowed=allowed, hint=f"leave it out, or {self._help()}")
+                what = f"'{rest[0]}' is one argument too many"
+                raise ConfigError(what, where=self.prog, allowed=self._usage(), hint=f"leave it out, or {self._help()}")
             said = unknown_name_error_arguments(flag, flags, self._help())
             raise ConfigError(f"there is no option '{flag}'", where=self.prog, **said)
         return found, rest
@@ -337,11 +337,22 @@ class _Parser(argparse.ArgumentParser):
             noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
             details = unknown_name_error_arguments(chosen[2], known, self._help())
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
-        where, allowed = self.prog, "the arguments that --help lists"
+        where, allowed, hint = self.prog, self._usage(), self._help()
+        if lacking := re.fullmatch(r"the following arguments are required: (.*)", message):
+            about = {(*own.option_strings, own.metavar)[0]: f" ({own.help})" for own in self._needed() if own.help}
+            hint = f"add {', '.join(name + about.get(name, '') for name in lacking[1].split(', '))}; {hint}"
         if wrong := re.fullmatch(r"argument (\S+): invalid (\w+) value: (.*)", message, re.DOTALL):
             allowed, where = {"int": "a whole number", "float": "a number"}[wrong[2]], f"{self.prog} {wrong[1]}"
             message = f"{wrong[1]} is {wrong[3]}, but must be {allowed}"
-        raise ConfigError(message, where=where, allowed=allowed, hint=self._help())
+        raise ConfigError(message, where=where, allowed=allowed, hint=hint)
+
+    def _needed(self) -> list[argparse.Action]:
+        return [own for own in self._actions if own.required or not (own.option_strings or own.nargs == "?")]
+
+    def _usage(self) -> str:
+        """Arguments that the command needs, such as `yid-ocp init ROBOT FILE ... --out CONFIG.yaml [OPTIONS]`."""
+        words = (" ".join([*own.option_strings[:1], str(own.metavar or own.dest)]) for own in self._needed())
+        return " ".join([self.prog, *words, "[OPTIONS]"])
 
     def _help(self) -> str:
         return f"see {self.prog} --help"

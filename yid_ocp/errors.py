@@ -145,7 +145,9 @@ def _close(name: str, names: Sequence[str], count: int, cutoff: float) -> list[s
 
 def nearest_name_question(name: str, names: Iterable[str]) -> str:
     """Return the question "did you mean NAME?" for the most similar known name. Empty if no name is similar."""
-    close = _close(name, [*names], 1, 0.6)
+    names = [*names]
+    longer = [entry for entry in names if len(name) > 3 and name.lower() in entry.lower()]
+    close = _close(name, names, 1, 0.6) or (longer if len(longer) == 1 else [])
     return f"did you mean '{close[0]}'?" if close else ""
 
 

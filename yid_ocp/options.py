@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import operator
 import types
 from collections.abc import Callable, Iterable, Mapping
@@ -112,10 +113,10 @@ def describe_type(hint: Any) -> str:
     """Describe a type, its range and its unit in words for messages, such as "a number above 0 up to 0.1 [s]"."""
     bare, markers = split_annotated(hint)
     unit = next((marker.unit for marker in markers if isinstance(marker, OptionInfo) and marker.unit), "")
-    limits = [f"{word} {limit:g}" for limit, _, word in _bounds(markers)]
-    text = " or ".join(dict.fromkeys(map(_words, non_none_union_members(bare))))
+    first, *others = dict.fromkeys(map(_words, non_none_union_members(bare)))
+    limits = [f" {word} {limit:g}" for limit, _, word in _bounds(markers)]
     least = [f", {marker.min_length} at least" for marker in markers if isinstance(marker, annotated_types.Len)]
-    return " ".join([text, *limits]) + "".join(least) + (f" [{unit}]" if unit else "")
+    return " or ".join(["".join([first, *limits, *least, f" [{unit}]" * bool(unit)]), *others])
 
 
 def _words(hint: Any) -> str:
@@ -129,12 +130,14 @@ def _words(hint: Any) -> str:
         return ", ".join(map(str, arguments))
     if get_origin(bare) is tuple:
         count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
-        return f"a list{count}, each {_words(arguments[0])}".replace(", each a section", " of sections", 1)
+        words = f"a list{count}, each {_words(arguments[0])}"
+        return words.replace(", each a section", " of sections", 1).replace(", each text", " of text", 1)
     if mapping_value_type(bare) is not None:
         choices = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
-        names = [name for own in choices for name in own.registry]
-        known = f", such as {{{names[0]}: {{}}}}, each NAME one of {', '.join(names)}" if choices else ""
-        return f"{{NAME: {'{}' if choices else _words(mapping_value_type(bare))}, ...}}{known}"
+        if names := [name for own in choices for name in own.registry]:
+            return f"a section, such as {{{names[0]}: {{}}}}, with names among {', '.join(names)}"
+        value = _words(mapping_value_type(bare))
+        return f"a section that has for each name {value}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
     needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
     return "a section" + f", such as {{{needed}}}" * bool(needed)
@@ -152,10 +155,12 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 def default_value_hint(key: str, option: Option) -> str:
     """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
-    default, said = option.default_value, f"set {key} to an allowed value"
+    default, about = option.default_value, split_annotated(option.type_hint)[1]
+    said = f"write an allowed value for {key}" + ", or leave it out" * (default is not MISSING)
     if isinstance(default, (int, float, str)) or (default and isinstance(default, tuple)):
-        return f"{said}, such as {[*default] if isinstance(default, tuple) else default}"
-    return said + ", or leave it out" * (default is not MISSING)
+        shown = default if isinstance(default, str) else json.dumps(default)
+        said = f"write {key}: {shown} (the default), or another allowed value"
+    return said + "".join(f". Its meaning: {own.description}" for own in about if isinstance(own, OptionInfo))
 
 
 def _within(hint: Any, value: Any) -> bool:

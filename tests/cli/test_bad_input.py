@@ -53,10 +53,10 @@ def edited(file, old, new):
     [
         ("held_out:", "heldout:", ("there is no key 'heldout'", "recordings.heldout", "did you mean 'held_out'?")),
         ("{free: true}", "{fre: true}", ("did you mean 'free'?", "parameters.shoulder.damping.fre")),
-        ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
-        ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "converted from ms")),
+        ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write 5 alone, without a unit")),
+        ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "write 0.01 alone")),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "such as 0.01")),
+        ("path_cutoff: .inf", "time_step: '0.01'", ("time_step", "time_step: 0.01 (the default)")),
         ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "from 0 to inf N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("upper bound of 0.5 N", "at most 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("upper bound of 100 N", "at most 100 N m/rad")),

@@ -38,7 +38,7 @@ def test_the_page_in_the_docs_is_current(repository, maker):
     told = "run  python docs/settings_page.py"
     assert (repository / "docs" / "reference" / "settings.md").read_text(encoding="utf-8") == page, told
     for line in (
-        f"| `time_step` | {STEP_WORDS} | a number above 0 up to 0.1 or auto [s] | `0.01` |",
+        f"| `time_step` | {STEP_WORDS} | a number above 0 up to 0.1 [s] or auto | `0.01` |",
         "## solver, name: multiple_shooting",
         "## model.object.named_segments.NAME",
         "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",

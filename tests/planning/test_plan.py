@@ -235,7 +235,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, (" m outside the box along z", "plan.frames_in_box")),
         ({"minimize_parameter_sensitivity": True}, ("parameters is not known", "plan.parameter_run_folder")),
         ({"n_spline_coefficients": 1}, ("n_spline_coefficients is 1", "from 2")),
-        ({"duration": -1.0}, ("duration is -1", "above 0")),
+        ({"duration": 0.01}, ("faster than its speed limit", "where: plan.duration\n")),
     ],
 )
 def test_what_is_refused(refused_with, moved, wanted, more, words):

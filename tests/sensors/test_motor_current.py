@@ -184,7 +184,7 @@ parameters: {{"*.damping": {{free: true}}}}
     assert load_problem(tmp_path / "run.yaml", ["sensors.motors_left.current.std=0.2"]).evaluate(
         problem.initial_unknowns
     ).cost == pytest.approx(problem.evaluate(problem.initial_unknowns).cost / 16, rel=1e-6)
-    with pytest.raises(ConfigError, match="has no constant 'torque_constan'"):
+    with pytest.raises(ConfigError, match="no constant 'torque_constan'"):
         load_problem(tmp_path / "run.yaml", ["sensors.motors_left.current.constants={torque_constan: 1}"])
     with pytest.raises(ConfigError, match=r"no recording has the sensor 'motors\.current'"):
         load_problem(tmp_path / "run.yaml", ["sensors.motors.current.std=0.2"])

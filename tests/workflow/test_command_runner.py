@@ -48,7 +48,7 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
             progress.report_parts_done(i, 100, f"frame {i}")
     tracking = ["tracking ...", *(f"  {10 * i} of 100, frame {10 * i}" for i in range(1, 11))]
     said = ["solving ...", *(f"  iteration 3, cost 12.5{k}, 1.2 s, first 2 s" for k in ("", *19 * [" (first 12.5)"]))]
-    assert capsys.readouterr().err.splitlines() == said + 2 * tracking
+    assert re.sub(r"[\d.]+ s, f", "1.2 s, f", capsys.readouterr().err).splitlines() == said + 2 * tracking
 
 
 @pytest.mark.parametrize(

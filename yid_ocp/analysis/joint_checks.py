@@ -353,7 +353,7 @@ def inverse_dynamics_effort_issues(arm: RecordedJointsModel, recording: Recordin
         j = int(np.argmax(ratio))
         words = f"the effort of {arm.joint_names[j]} is {ratio[j]:.3g} times its effort limit ({largest[j]:.3g} N m; "
         words += f"{_MAX_EFFORT_RATIO:g} times is tolerated)"
-        advice = "check the unit of efforts (N m) and the effort limit in the robot's URDF"
+        advice = "check the effort limit in the URDF. If efforts are in N mm, import again with --units 'effort=N mm'"
         found.append(_issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j]))
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:

@@ -79,7 +79,8 @@ def compute_profile_likelihood_interval(
     deltas = np.array([point.chi2 for point in points]) - walk.base
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     better = ""
-    if walk.base < -1.0:  # one standard deviation; a smaller difference does not show which value is better
+    far = abs(values[np.argmin(deltas)] - x[index]) > (std if math.isfinite(std) else 0.0)
+    if walk.base < -1.0 and far:  # both by one standard deviation; less does not show which value is better
         best, setting = f"{values[np.argmin(deltas)]:.4g}", f"parameters.{name.partition('[')[0]}.initial"
         better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so the fit missed the best value. "
         better += f"Repeat `yid-ocp solve` with --set {setting}={best}"

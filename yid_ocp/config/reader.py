@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import functools
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
@@ -34,6 +35,14 @@ SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # of an alias in entries, because merging one compares its mapping with all others
 _ALLOWED_YAML = "keys whose values are numbers, text, true or false, [lists] or sections"
+_FACTORS = {("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("min", "s"): 60.0, ("mm", "m"): 1e-3, ("cm", "m"): 1e-2}
+_FACTORS |= {("deg", "rad"): math.pi / 180, ("g", "kg"): 1e-3, ("kHz", "Hz"): 1e3, ("mN m", "N m"): 1e-3}
+_YAML_FAULTS = {  # what the parser says: in plain words, and the cure
+    "expected <block end>": ("its indentation differs from that of the lines above", "align the keys of each section"),
+    "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
+    "cannot start any token": ("a tab, or a character that needs quotes", "indent by spaces, and quote such text"),
+    "could not find expected ':'": ("a key without a colon", "write KEY: VALUE, with a space after the colon"),
+}
 
 
 def load_config(
@@ -127,10 +136,12 @@ def _loaded(text: str, origin: str) -> Any:
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
+        known = (words for part, words in _YAML_FAULTS.items() if part in f"{error.context} {problem}")
+        problem, hint = next(known, (problem, "check indentation, brackets and colons near this line"))
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
-        hint = "remove one of the two" if twice else "check indentation, brackets and colons near this line"
-        raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
+        allowed, hint = ("each key once in a section", "remove one of the two") if twice else (_ALLOWED_YAML, hint)
+        raise ConfigError(what, where=f"{origin}{line}", allowed=allowed, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
         what, hint = "the file is not valid YAML", "remove numbers of over 4000 digits, and keys that are lists"
@@ -183,7 +194,10 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
-        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "put a space after colons, and close brackets"
+        spaced = re.sub(r":(?=\S)", ": ", value_text)
+        what, hint = f"the value '{value_text[:80]}' is not valid YAML", "close brackets and quotation marks"
+        if "{" in value_text and spaced != value_text:
+            what, hint = f"{what}: a space is missing after a colon", f"write --set '{key.strip()}={spaced}'"
         raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from error
     parent = data
     for i, part in enumerate(path[:-1]):
@@ -282,7 +296,9 @@ class _Reader:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.options_of_variant(sections.default_variant))
-            what, hint = f"{self._name(path)} = {_shown(raw)} is not a section", _key_meant(self._name(path), keys)
+            name, what = self._name(path), f"{self._name(path)} = {_shown(raw)} is not a section"
+            near = difflib.get_close_matches(name.rpartition(".")[2], keys, 1, 0.65)
+            hint = f"did you mean '{near[0]}'?" if near else f"add a key, as in {name}.{keys[0]}"
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
         word = sections.read_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
@@ -304,17 +320,24 @@ class _Reader:
         return kind(**values)
 
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath, default: Any) -> ConfigError:
+        named = schema.section_variants_from_annotation(options.mapping_value_type(hint))
         unit = schema.option_info_from_annotation(hint).unit
         advice = options.default_value_hint(self._name(path), options.Option(hint, default))
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
-            advice = f"write the number alone, in {unit}" if unit else "write the number alone"
-            if unit and match[2].strip() != unit:
-                advice += f", converted from {match[2].strip()}"
-        if isinstance(raw, dict) and options.variadic_tuple_entry_type(hint) is not None:
+            given = match[2].strip()
+            factor = 1.0 if given == unit else _FACTORS.get((given, unit), 0.0) if match[1].count(".") < 2 else 0.0
+            number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
+            advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
+        lists = map(options.variadic_tuple_entry_type, options.non_none_union_members(hint))
+        if isinstance(raw, (dict, str)) and any(entry is not None for entry in lists):
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
-        if isinstance(raw, str) and not re.match(r"[-+.\d\s]", raw) and (choices := options.literal_choices(hint)):
-            advice = f"choose an allowed value ({schema.option_info_from_annotation(hint).description})"
-            advice = nearest_name_question(raw, choices) or advice
+        if isinstance(raw, str):
+            advice = nearest_name_question(raw, options.literal_choices(hint)) or advice
+        if isinstance(raw, (list, str)) and named is not None and named.selector_key == "name":
+            asked = [raw] if isinstance(raw, str) else [own for own in raw if isinstance(own, str)]
+            meant = [next(iter(difflib.get_close_matches(own, named.classes, 1)), own) for own in asked]
+            entries = ", ".join(f"{own}: {{}}" for own in dict.fromkeys(meant))
+            advice = f"write a section, {self._name(path)}: {{{entries}}}, in place of {_shown(raw)}"
         shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and not {*",'"} & {*unit} else _shown(raw)
         what = f"{self._name(path)} is {shown}, which is not allowed"
         return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
@@ -322,13 +345,6 @@ class _Reader:
     @staticmethod
     def _name(path: _KeyPath) -> str:
         return ".".join(map(str, path)) or "the configuration"
-
-
-def _key_meant(name: str, keys: Sequence[str]) -> str:
-    """Return a suggested key if the last part of `name` is missing or misspelt. Names of users may contain dots."""
-    within, _, last = name.rpartition(".")
-    close = difflib.get_close_matches(last, keys, n=1, cutoff=0.65)
-    return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"
 
 
 _adapter = functools.cache(TypeAdapter)

@@ -102,8 +102,7 @@ class _JointActuationSettings:
         Literal["driven", "prescribed", "servo", "passive"],
         OptionInfo(
             "driven: measured efforts move the joints; prescribed: they move as measured; servo: position servos "
-            "follow recorded commands; passive: no drive. A prescribed arm with a grasp and recorded efforts is "
-            "simulated as a driven one, with its measured angles as data of the fit"
+            "follow recorded commands; passive: no drive"
         ),
     ] = "driven"
     servo: Annotated[ServoModelOptions, OptionInfo("position servos of the mode servo")] = field(

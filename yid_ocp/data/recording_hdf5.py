@@ -57,12 +57,12 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     """
     path = Path(path)
     digest, allowed = files.file_sha256(path), f"HDF5 in the format {_RECORDING_FORMAT}"
-    hint = f"convert another format by `yid-ocp import {path} --out RECORDING.h5`, or read it by yid_ocp.read_any"
+    what, hint = "the file is not an HDF5 file", f"convert it by `yid-ocp import {path} --out RECORDING.h5`"
     if path.suffix == ".h5":
         hint = "give a file of another format its usual ending, such as .csv, and convert it by `yid-ocp import`"
     elif path.suffix == ".yaml":
-        hint = f"give the run folder that `yid-ocp solve {path}` makes"
-    raise_data_error_unless(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
+        what, hint = "this is a configuration", f"give the run folder that `yid-ocp solve {path}` makes, or a recording"
+    raise_data_error_unless(h5py.is_hdf5(path), what, str(path), allowed, hint)
     with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)
     return validated_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))

@@ -214,7 +214,7 @@ def _parsed(file: Path) -> SimpleNamespace:
         raise
     except Exception as error:  # a malformed file raises many kinds
         reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
-        allowed, hint = "a URDF file with links and joints", "give it before recordings; if damaged, run `check_urdf`"
+        allowed, hint = "a URDF file with links and joints", f"find the place by `check_urdf {file}`, and correct it"
         raise ModelError(f"the URDF cannot be read: {reason}", where=str(file), allowed=allowed, hint=hint) from error
 
 
@@ -448,9 +448,7 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
     found, waiting, links = set[str](), list(excluded), [link.name for link in robot.links]
     while waiting:
         link = waiting.pop()
-        if link not in links:
-            what, otherwise = f"there is no link '{link}' to leave out", f"remove '{link}' from exclude_links"
-            raise ModelError(what, where=where, **unknown_name_error_arguments(link, links, otherwise))
+        require_known_names([link], links, "link", f"{where}: exclude_links", ModelError)
         found.add(link)
         waiting += [joint.child for joint in robot.joints if joint.parent == link]
     return found

@@ -133,9 +133,10 @@ def servo_gain_parameters_by_recording(system: System, recordings: Sequence[Reco
         found[recording.name] = {wanted[name]: float(gains[column]) for name, column in columns.items()}
     if found and silent:
         what = "the recording has no proportional gain of its servos, but others have it"
-        hint = "write the attribute in all recordings, or remove it from all and set parameters.*.servo_gain_factor"
+        hint = f"use only recordings with the gain, or write it: python -c \"import h5py; h5py.File('{silent[0]}.h5', "
+        hint += "'r+')['joints'].attrs['proportional_gain'] = GAIN\""
         where = f"recording '{silent[0]}': joints, attribute proportional_gain"
-        raise DataError(what, where=where, allowed="the gain in all recordings, or in none", hint=hint)
+        raise DataError(what, where=where, allowed="the attribute in all recordings, or in none", hint=hint)
     return found
 
 

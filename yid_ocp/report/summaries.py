@@ -92,7 +92,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for name, entry in free.items():
         verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
         std = "no limit" * (verdict == "weak") if entry["std"] is None else f"{entry['std']:.2g}"
-        std *= verdict not in ("", "at_bound")
+        std *= verdict not in ("", "at_bound") and entry["value"] not in (entry["lower"], entry["upper"])
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         own = ("–" if verdict == "not_identifiable" else value, std, interval, shown_unit(entry["unit"]))
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""

@@ -38,7 +38,7 @@ class SensorOptions:
     ] = None
     std: Annotated[
         _Positive | Mapping[str, _Positive] | None,
-        OptionInfo("noise standard deviation instead of the recorded one, by name if they differ", "m, rad, N m, ..."),
+        OptionInfo("noise standard deviation instead of the recorded one, by name if they differ", "sensor's SI unit"),
     ] = None
     frame_by_recorded_name: Annotated[
         Mapping[str, str],
@@ -50,7 +50,7 @@ class SensorOptions:
         OptionInfo(
             "standard deviation of a constant error of each joint's torque, or of each component of a wrist sensor "
             "or IMU, independent in every recording, instead of the recorded one",
-            "N m, ...",
+            "the sensor's SI unit",
         ),
     ] = None
     clock_offset_std: Annotated[

@@ -265,6 +265,7 @@ def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[i
         worst = system.grasps[int(np.abs(result.fun[: gap.numel_out(0)]).argmax()) // 3]
         where, size = f"model.grasp.{worst.name}", f"{miss:.3g} m" if miss >= 1 else f"{1e3 * miss:.3g} mm"
         what = f"{worst.holder_frame} cannot reach {worst.held_frame}: {size} are missing at the best angles found"
-        hint = "set model.object.mount.xyz nearer to the robot, or grasp another point"
+        hint = "set model.object.mount.xyz nearer to the robot, or grasp another point; for a motion from given angles "
+        hint += "(plan.start_joint_positions), use `yid-ocp plan`"
         raise ModelError(what, where=where, allowed="grasps within reach and within the joint limits", hint=hint)
     return at(result.x)

@@ -144,8 +144,10 @@ def build_problem(
         _refuse_object_mounted_on_driven_arm(run, system)
     free = free_parameter_names(run, system.parameters)
     if not free:
-        choice = unknown_name_error_arguments("", system.parameters.names, "set parameters.NAME.free: true")
-        raise run.config_error("no parameter is free, so there is nothing to estimate", "parameters", **choice)
+        names = sorted(system.parameters.names, key=lambda name: (name not in run.parameters, name.endswith(".mass")))
+        allowed = ", ".join(names[:8]) + f" and {len(names) - 8} more" * (len(names) > 8)
+        what, hint = "no parameter is free, so there is nothing to estimate", f"set parameters.{names[0]}.free: true"
+        raise run.config_error(what, "parameters", allowed=f"one free parameter or more, among {allowed}", hint=hint)
     if same := sorted(set(run.recordings.estimate) & set(run.recordings.held_out)):
         what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"
         raise run.config_error(what, "recordings", "held_out", allowed="each recording in only one of them", hint=hint)
@@ -205,21 +207,19 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
     known = {key for recording in recordings for key in recording.sensor_setting_keys}
+    without = all(own.joints is None or own.joints.effort is None for own in recordings)
+    shown = sorted(known - ({JOINT_EFFORT_SENSOR_KEY} if without else set()))
     for name, said in run.sensors.items():
         if name not in known:
             what, hint = f"no recording has the sensor '{name}'", f"leave sensors.{name} out, or correct the name"
-            raise run.config_error(what, "sensors", name, **unknown_name_error_arguments(name, sorted(known), hint))
+            raise run.config_error(what, "sensors", name, **unknown_name_error_arguments(name, shown, hint))
         if said.effort_sampling_kind is not None and name != JOINT_EFFORT_SENSOR_KEY:
             what, hint = f"'{name}' measures no efforts", f"set it under sensors.{JOINT_EFFORT_SENSOR_KEY} or remove it"
             where, allowed = ("sensors", name, "effort_sampling_kind"), f"only under {JOINT_EFFORT_SENSOR_KEY}"
             raise run.config_error(what, *where, allowed=allowed, hint=hint)
         group, _, quantity = name.rpartition(".")
         constants = next((c.constants for c in channel_specs_for_group_name(group) if c.quantity == quantity), {})
-        for constant in said.constants:
-            if constant not in constants:
-                details = unknown_name_error_arguments(constant, constants)
-                what = f"'{name}' has no constant '{constant}'"
-                raise run.config_error(what, "sensors", name, "constants", **details)
+        check_names_in_setting(run, "constant", said.constants, constants, "sensors", name, "constants")
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:

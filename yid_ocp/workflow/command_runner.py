@@ -162,7 +162,8 @@ class _RemainingTime:
         self.n_iterates += 1
         self._first_cost = entry.cost if self.n_iterates == 1 else self._first_cost
         cost = f"cost {entry.cost:.6g}" + f" (first {self._first_cost:.6g})" * (self.n_iterates > 1)
-        return ", ".join(filter(None, (f"iteration {entry.iteration}", cost, f"{entry.seconds:.1f} s", entry.note)))
+        seconds = f"{time.monotonic() - self._start_of_command:.1f} s"  # several searches follow each other
+        return ", ".join(filter(None, (f"iteration {entry.iteration}", cost, seconds, entry.note)))
 
     def of_parts(self, done: int, total: int) -> str:
         """Return the text of a stage's remaining time, from its done parts. Empty if the command's time is known."""

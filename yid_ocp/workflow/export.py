@@ -158,8 +158,8 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         what, hint = f"a run cannot be exported as '{form}'", f"write --format mjcf (model) or mcap (signals){why}"
         raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     if out.is_file():
-        what, hint = f"{out.name} already exists", "choose another --out, or rename the file"
-        raise OutputError(what, where=str(out), allowed="a new file", hint=hint)
+        what, hint = f"{out.name} already exists, and `export` overwrites nothing", "choose another --out, or remove it"
+        raise OutputError(what, where=str(out), allowed="a file that does not exist yet", hint=hint)
     progress.begin_stage("building the model")
     full, unknown = calibrated.system(), [n for n, std in calibrated.parameter_stds.items() if std is None]
     if form == "yaml":

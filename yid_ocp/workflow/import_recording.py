@@ -72,7 +72,7 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
     found, said = list[dict[str, Any]](), list[str]()
     for file in arguments.files:
         with stderr_progress_display(arguments) as progress:
-            progress.begin_stage(f"reading {file}")
+            progress.begin_stage(f"listing the contents of {file}")
             contents = preview_file(file, progress)
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
             sources = [attributes_to_dict(own, keys) for own in contents.sources]
@@ -122,14 +122,14 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     return [*recording_issue_lines(recording), "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
 
 
-def recording_issue_lines(recording: Recording) -> list[str]:
+def recording_issue_lines(recording: Recording, more_flags: str = "") -> list[str]:
     """Return lines about the issues of a recording that show without a model: units, clocks, few samples, no motion."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     said = [f"issue ({issue.certainty_word}): {issue.what}\n  try: {issue.advice}" for issue in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit} --replace")
+        said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
     return ["", *said] if said else []
 
 

@@ -18,6 +18,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema, option_info_from_annotation
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
+from yid_ocp.data.readers import READERS
 from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
@@ -45,6 +46,12 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     if out.suffix not in (".yaml", ".yml"):
         hint = f"write --out {out.parent / (out.stem + '.yaml')}"
         raise ConfigError(f"'{out.name}' does not end in .yaml", where="--out", allowed=".yaml or .yml", hint=hint)
+    if Path(robot).suffix.lower() in READERS:
+        first = next((file for file in arguments.files if Path(file).suffix in (".urdf", ".xml")), "ROBOT.urdf")
+        order = shlex.join([first, robot, *(file for file in arguments.files if file != first)])
+        what, allowed = f"{Path(robot).name} is a recording, not a robot", "a URDF or MJCF file, or package:NAME"
+        hint = f"give the robot first: yid-ocp init {order} --out {out}"
+        raise ConfigError(what, where=f"yid-ocp init {robot}", allowed=allowed, hint=hint)
     read_urdf(robot)
     item = _object_from_arguments(arguments)
     with stderr_progress_display(arguments) as progress:
@@ -57,9 +64,11 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
-            hint, allowed = "add --replace to overwrite it, or choose an --out in another folder", "a new file"
+            hint = "add --replace to overwrite it, or choose an --out in another folder"
+            allowed = "files that do not exist yet, or --replace"
             hint = f"to use it again, give {file} as the recording; or {hint}" if file in written else hint
-            raise OutputError(f"{file.name} already exists", where=str(file), allowed=allowed, hint=hint)
+            what = f"{file.name} already exists, and `init` would write it"
+            raise OutputError(what, where=str(file), allowed=allowed, hint=hint)
 
     def near(path: str | Path) -> str:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
@@ -72,7 +81,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
     result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    lines = [line for own in recordings for line in import_recording.recording_issue_lines(own) if line]
+    lines = [line for own in recordings for line in import_recording.recording_issue_lines(own, " --replace") if line]
     lines += _summary_lines(proposal, out, recordings, result["picture"] is not None)
     end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
     print_result(arguments, result, lambda: lines, end, str(out))
@@ -120,7 +129,8 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         density = own.mass / (own.length * width * height)
         if density < 5 or density > 20_000:
             what, allowed = f"'{own.name}' has the density {density:.2g} kg/m^3", "5 (foam) to 20000 kg/m^3 (tungsten)"
-            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint="give kg and m")
+            hint = "give the mass in kg, and the length and the radius (or --section) in m"
+            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint=hint)
     return item
 
 

@@ -96,7 +96,7 @@ def copyable_estimate_texts(
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
             sizes = {term: [at[term] for at in own if term in at] for term in ("stiffness", "damping")}
             count = len(layout.link_joints)
-            note = f"{' '.join(key)}, {count} links; for n links, multiply by n/{count}"
+            note = f"{' '.join(key)}, {count} links; for n links, multiply the stiffness by n/{count}"
             if stiffness := sizes["stiffness"]:
                 low, high = min(stiffness), max(stiffness)
                 known = {"segment": key[0], "deformation": key[1], "links": count}
@@ -131,6 +131,7 @@ def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> di
         found[joint] = {key.replace("dry_friction", "frictionloss"): sizes[key] for key in sizes if key in changed}
         if changed & {"stiffness", "constant_force"} and own.stiffness > 0:
             found[joint] |= {"stiffness": own.stiffness, "springref": own.constant_force / own.stiffness}
+            found[joint] |= {"damping": own.damping} if own.damping > 0 else {}
     return found
 
 

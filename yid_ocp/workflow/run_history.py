@@ -31,7 +31,12 @@ from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_prin
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
 from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import read_recordings_of_role, resolve_recording_path, uniquely_named_recordings
+from yid_ocp.workflow.run_inputs import (
+    existing_input_file,
+    read_recordings_of_role,
+    resolve_recording_path,
+    uniquely_named_recordings,
+)
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +52,7 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
 
     Raises `DataError` without a finished run, or for a result that is unreadable, old, of another command, or failed.
     """
-    file, result = Path(folder) / "result.json", read_estimation_result(folder)
+    file, result = Path(folder) / "result.json", read_estimation_result(folder, needs_minimum=True)
     again = f"repeat the run with this version: {result.get('command', 'the command of this folder')}"
     try:
         said = result.get("model", result)  # of a diagnosis, the final model
@@ -68,8 +73,9 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
         raise DataError(what, where=str(file), allowed=allowed, hint=again) from error
     if not names:
-        what, hint = "the run has found no parameter", "use a run that has found a parameter"
-        raise DataError(what, where=str(file), allowed="one parameter or more with a standard deviation", hint=hint)
+        what, allowed = "the run has found no parameter", "a run in which one free parameter or more can be found"
+        hint = "leave this run out; `yid-ocp identifiability` shows which recordings would determine its parameters"
+        raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)
@@ -94,8 +100,13 @@ def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[
     return replace(run, model=replace(run.model, effects=(*run.model.effects, *added)))
 
 
-def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve", "diagnose")) -> dict[str, Any]:
-    """Read result.json of a successful run of one of the `commands`. Errors are as in `read_estimates`."""
+def read_estimation_result(
+    folder: str | Path, commands: Sequence[str] = ("solve", "diagnose"), needs_minimum: bool = False
+) -> dict[str, Any]:
+    """Read result.json of a successful run of one of the `commands`. Errors are as in `read_estimates`.
+
+    With `needs_minimum`, a fit that did not converge is an error, because standard deviations hold at a minimum only.
+    """
     file = Path(folder) / "result.json"
     result, formats = read_result_file(file), [ESTIMATE_FORMAT_BY_COMMAND[command] for command in commands]
     if result.get("format") not in formats:
@@ -105,6 +116,9 @@ def read_estimation_result(folder: str | Path, commands: Sequence[str] = ("solve
     if result.get("status") == "failed":
         what, hint = f"the run in this folder failed: {result.get('message')}", "give the folder of a successful run"
         raise DataError(what, where=str(file), allowed="a successful run", hint=hint)
+    if needs_minimum and result.get("status") == "iteration_limit":
+        what, allowed = "the fit of this run did not converge, so its values are not estimates", "a run that converged"
+        raise DataError(what, where=str(file), allowed=allowed, hint=f"repeat the run: {result['message']}")
     return result
 
 
@@ -217,11 +231,7 @@ def recordings_without_effect_or_reason(run: RunSettings) -> tuple[tuple[Recordi
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.without_effect):
         file = resolve_recording_path(path)
-        if not is_file(file):
-            where = ("recordings", "without_effect", i)
-            what, allowed = f"there is no such recording: {file}", "the path of an existing file"
-            raise run.config_error(what, *where, allowed=allowed, hint="correct the path, or remove it from the list")
-        found.append(read_recording(file))
+        found.append(read_recording(existing_input_file(run, file, "recording", "recordings", "without_effect", i)))
     for folder in () if found else run.diagnosis.baseline_run_folders:
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
@@ -243,10 +253,8 @@ def require_recordings_not_in_baseline(
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
-            where, hint = (
-                ("diagnosis", "baseline_run_folders"),
-                "leave it out of `recordings`, or choose another baseline",
-            )
+            where = ("diagnosis", "baseline_run_folders")
+            hint = "leave it out of `recordings`, or choose another baseline"
             what = f"the recording {episode.name} would count twice, because the baseline has it too"
             if not runs or run.recordings.without_effect:
                 where, hint = ("recordings", "without_effect"), "remove it from one of the two lists"
@@ -322,7 +330,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     """Overlay two runs of the same recordings and write `overlay.json` and report.html."""
     progress.begin_stage("overlaying the predictions of both runs")
     labels = [folder.name if folders[0].name != folders[1].name else str(folder) for folder in folders]
-    results, roles = [read_estimation_result(folder) for folder in folders], dict[str, list[str]]()
+    results, roles = [read_estimation_result(folder, needs_minimum=True) for folder in folders], dict[str, list[str]]()
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -154,24 +155,29 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
     Raises `ConfigError` if a file does not exist. The message has the setting and the most similar existing file.
     """
     files = {"configuration": Path(run.config_file)} if run.config_file else {}
-    files |= {path: _existing(run, Path(path), "plug-in", "plugins", i) for i, path in enumerate(run.plugins)}
+    files |= {path: existing_input_file(run, Path(path), "plug-in", "plugins", i) for i, path in enumerate(run.plugins)}
     robot = run.model.robot
     if robot is not None:
         with add_setting_location_to_errors(run, "model", "robot"):
             file = urdf_path_from_robot_name(robot)
-        files[robot] = _existing(run, file, "URDF file", "model", "robot")
+        files[robot] = existing_input_file(run, file, "URDF file", "model", "robot")
     for key, name in {} if run.model.object is None else run.model.object.input_file_paths().items():
-        files[name] = _existing(run, Path(name), "file", "model", "object", key)
+        files[name] = existing_input_file(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+            files[path] = existing_input_file(run, resolve_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
-def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
+def existing_input_file(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
+    """Return the path of an existing file. Raises `ConfigError` with the setting `key` and the most similar file."""
     if is_file(file):
         return file
-    hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
+    folder = Path(run.config_file).resolve().parent
+    here = Path(os.path.relpath(file, folder))  # the path as written, which may be meant from the working directory
+    hint = f"write {os.path.relpath(here, folder)}: paths are relative to the folder of the configuration file"
+    if not is_file(here):
+        hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
     raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
 
 
@@ -190,7 +196,7 @@ def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: in
     others = () if which == "estimate" else map(resolve_recording_path, run.recordings.estimate)
     found: list[Recording] = []
     for i, path in enumerate(getattr(run.recordings, which)[:count]):
-        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+        file = existing_input_file(run, resolve_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             found.append(read_recording(file))
     return uniquely_named_recordings(found, [path.stem for path in others])

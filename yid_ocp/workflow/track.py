@@ -62,7 +62,7 @@ def _run_track(
             with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.work_folder / _CONFIG_FILE), _read_joints(tasks.settings)
                 issues = [] if recording is None else data_quality_issues_of_recording(run, system, recording)
-                progress.begin_stage("finding what all images share: camera, clock and dimensions")
+                progress.begin_stage("finding what all images share: camera, clock and dimensions (can take minutes)")
                 common = tasks.estimate_shared_values()
                 progress.begin_stage("fitting the object in every image")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
@@ -192,9 +192,9 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     if not system.driven:
-        what = "there are no camera frames, and a virtual experiment needs driven joints, and the model has none"
-        hint = "set track.frames_path, or model.arms.mode: driven for a virtual experiment"
-        raise run.config_error(what, "track", "frames_path", allowed="a path of frames of a camera", hint=hint)
+        what = "there are no camera frames: track.frames_path is missing"
+        hint = "set track.frames_path: PATH. Without it, frames are simulated, which needs model.arms.mode: driven"
+        raise run.config_error(what, "track", "frames_path", allowed="a file or folder of camera frames", hint=hint)
     settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
     offsets, key = settings.gripper_start_offset_from_object_end, "gripper_start_offset_from_object_end"
     check_names_in_setting(run, "grasp", offsets, grasps, "track", "virtual_frames", key)

@@ -17,7 +17,8 @@ from yid_ocp.data.readers.base import READERS as READERS
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.display import NULL_PROGRESS, Progress
-from yid_ocp.errors import DataError, nearest_file_question, unknown_name_error_arguments
+from yid_ocp.errors import DataError, unknown_name_error_arguments
+from yid_ocp.files import check_input_file
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -72,13 +73,14 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 
 def _format_of(path: Path) -> str:
     if not path.suffix and not path.exists():
-        hint = nearest_file_question(path) or "correct the path: its folder has no file of a similar name"
-        allowed = "the path of a file or folder that you may read"
-        raise DataError("there is no such file", where=str(path), allowed=allowed, hint=hint)
+        check_input_file(path)
     key = path.suffix.lower()
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
-        what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ... (robots: `init`)"
-        raise DataError(what, where=str(path), **unknown_name_error_arguments(key.replace(".urdf", ""), READERS, hint))
+        what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ..."
+        if key in (".urdf", ".xml"):
+            what, hint = "this is a robot, not a recording", f"give the robot to `init`: yid-ocp init {path} RECORDING"
+            key = ""
+        raise DataError(what, where=str(path), **unknown_name_error_arguments(key, READERS, hint))
     return key

@@ -73,9 +73,9 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(unit) in map(_spaceless, known)), None)
         if of is None:
-            every = dict.fromkeys(chain(*_TO_SI.values()))  # metres are units of two quantities
-            said = unknown_name_error_arguments(word, every, "write for example --units deg,mm")
-            raise DataError(f"the unit '{word}' is unknown", where="--units", **said)
+            every = ", ".join(dict.fromkeys(chain(*_TO_SI.values())))  # metres are units of two quantities
+            hint = "write the units of the file's values, such as --units deg,mm, or convert the values"
+            raise DataError(f"the unit '{word}' is unknown", where="--units", allowed=every, hint=hint)
         own = [q for q, si in _QUANTITIES.items() if si == of and (q == "effort" or unit not in MOTOR_CURRENT_UNITS)]
         for quantity in own:
             _set_unit(units, quantity, unit)
@@ -155,8 +155,9 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
         elif options.torque_constants or options.gear_ratios:
-            what, hint = "torque constants or gear ratios are given, but the file has no efforts", "leave them out"
-            raise DataError(what, where=where, allowed="both with efforts", hint=hint)
+            what = "torque constants or gear ratios are given, but the file has no efforts"
+            hint = "leave them out, or give the columns of currents: --columns COLUMN=effort:JOINT"
+            raise DataError(what, where=where, allowed="torque constants and gear ratios with efforts", hint=hint)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen, chosen = list[PointGroup](), options.point_names
     for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):

@@ -316,12 +316,12 @@ def _read_table(
 
 def _check_header(header: Sequence[str], path: Path, options: _CsvOptions) -> None:
     what, where = "the table is empty", f"{path}, line 1"
-    raise_data_error_unless(any(header), what, str(path), _ALLOWED, "export the measurements again")
+    raise_data_error_unless(any(header), what, str(path), _ALLOWED, "export the measurements again: it has no text")
     is_lost = options.has_header and all(_is_number(cell) for cell in header)
     hint = "add --no-header --columns t,position:JOINT,... with a meaning (or skip) for every column"
     raise_data_error_unless(not is_lost, "the table has no header row", where, _ALLOWED, hint)
     others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
-    hint = f"set --delimiter {others[0]}" if others else "export the times and the measurements as columns"
+    hint = f"set --delimiter {others[0]}" if others else "set the character between columns, such as --delimiter '|'"
     raise_data_error_unless(len(header) > 1, f"the table has one column, '{header[0]}'", str(path), _ALLOWED, hint)
     name, count = Counter(header).most_common(1)[0] if options.has_header else ("", 1)
     allowed, hint = "different names for all columns", f"rename one of them to '{name}_2' in the header"
@@ -401,11 +401,13 @@ def _meanings(
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given:
-            channels = ", ".join(f"{channel}_<joint>" for channel in JOINT_CHANNEL_UNITS)
-            allowed = f"t, q_<joint>, {channels}, <point>_x, <point>_y, <point>_z, <link>_force_x, and so on, with a "
-            allowed += "unit such as [ms], [deg], [N m], or without"
-            hint = f"rename the column, give its meaning (--columns '{name}=position:JOINT', of a current effort:JOINT "
-            hint += f"with --torque-constants), or leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}')"
+            allowed = "a name such as t, q_<joint>, velocity_<joint>, effort_<joint>, position_command_<joint>, "
+            allowed += "<point>_x or <link>_force_x, then the unit if it is not SI, such as [deg]"
+            meaning = f"'{name}=position:JOINT'"
+            if "current" in name.lower():
+                meaning = f"'{name}=effort:JOINT' --units effort=A --torque-constants JOINT=N_M_PER_A"
+            hint = f"leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}'), or give its meaning, such as "
+            hint += f"--columns {meaning}"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
@@ -429,7 +431,7 @@ def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
     if not name or kind not in known:
         what = f"the meaning '{given}' of column '{column}' is unknown"
         allowed = f"t, {base.SKIP_COLUMN_KEYWORD}, or KIND:NAME with the name of a joint, point or sensor and the "
-        allowed += f"kind {', '.join(known)}"
+        allowed += f"kind {', '.join((*JOINT_CHANNEL_UNITS, *AXES))} or a component such as {_COMPONENTS[0]}"
         meant = (kind, "NAME") if kind in known else column_meanings([given], _COMPONENTS)[0][0]  # `torque:elbow`
         hint = "" if meant else nearest_name_question(kind, ("t", base.SKIP_COLUMN_KEYWORD, *known))
         example = ":".join(meant or ("position", "JOINT")).strip(":")
@@ -443,8 +445,10 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     for meaning in wanted:
         if meaning not in places:
             what, skip = f"the table has no column for {meaning[0]} of '{meaning[1]}'", base.SKIP_COLUMN_KEYWORD
-            allowed = "every channel for all joints (position is required); x, y and z of every point and sensor"
-            hint = f"add the column, or leave the other columns of this channel out: --columns NAME={skip}"
+            allowed, rest = "every channel for all joints, with their position", "same channel of other joints"
+            if meaning[0][-1] in AXES:
+                allowed, rest = "x, y and z for every point and sensor", "other axes"
+            hint = f"add the column, or leave out the columns of the {rest}: --columns NAME={skip}"
             names = [name for _, name in meanings]  # a misspelt one has a single column
             lone = [name for name in names if names.count(name) == 1 and name != meaning[1]]
             raise DataError(what, where=where, allowed=allowed, hint=nearest_name_question(meaning[1], lone) or hint)
