@@ -333,6 +333,9 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     header = ",".join(["t", "q_slide [mm]", *(f"ft_torque_{axis} [Nm]" for axis in "xyz")])
     path = table(tmp_path, f"{header}\n0,90,1,2,3\n1,91,1,2,3\n")
     assert joints_of(read_any(path)).position[0, 0] == pytest.approx(0.09)
+    # a counter of rows, a rail and a hinge
+    path = table(tmp_path, "Frame,t,rail q [m],pan q [rad],rail tau [N],pan tau [Nm]\n0,0,1,1,5,2\n1,1,2,1,5,2\n")
+    np.testing.assert_array_equal(joints_of(read_any(path)).effort, [[5, 2], [5, 2]])
 
 
 RIGID = "Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error"

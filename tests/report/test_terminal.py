@@ -151,7 +151,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
             0.003,
             0.002,
             BAD,
-            "is 3 mm on held-out and 1.8 mm on fitted recordings. Noise alone gives 2 mm, the best guess without a model 30 mm.",
+            "is 3 mm on held-out and 1.8 mm on fitted recordings. Noise alone gives 2 mm, the best guess without a mod",
         ),
     ],
 )

@@ -214,6 +214,10 @@ def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     assert [effect.kind for effect in run.model.effects] == ["effort_offset"] * 2
     assert run.parameters["roll.damping"].free
     assert run.sensors["joints.effort"].std == pytest.approx(1.0, rel=0.2)
+    made = moved(SHORT, parts=(), effort=True)
+    unlike = replace(made, joints=replace(made.joints, effort=made.joints.effort * [1.0, 0.1]))
+    stds = proposed(unlike, *beam).sensors["joints.effort"].std
+    assert stds == pytest.approx({"roll": 1.0, "pitch": 0.1}, rel=0.2), "noise that differs is stated by joint"
     item = build_system(run)
     assert item.prescribed == ("roll", "pitch")
     assert "effort_offset@roll.offset" in item.parameters

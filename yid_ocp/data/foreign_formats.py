@@ -27,6 +27,7 @@ _LONGEST_FIRST = sorted(_CHANNEL_BY_WORD, key=len, reverse=True)
 _TOPIC_PREFIX = re.compile(r"(?:field_|(?:\w*_)?joint_states?_)(?=.)", re.IGNORECASE)
 UNIT_BY_WORD: Mapping[str, str] = {word: unit for unit, words in _WORDS["units"].items() for word in words}
 """Units in the spellings of headers, in lower case."""
+COUNTER_WORDS = frozenset(_WORDS["counters"])  # names of columns that count rows, in lower case
 _NUMBERED_COMMAND = re.compile(r"q_(d|des|ref|cmd)_\d+")  # of a joint without a name
 _NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
 _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
@@ -48,7 +49,7 @@ def column_meanings(
         if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
         meanings.append(meaning)
-        if meaning and unit and not (meaning[0] in sensor_components and unit in ("N m", "rad/s")):
+        if meaning and unit and not (meaning[0] in sensor_components and unit in ("N", "N m", "rad/s")):
             units["points" if meaning[0] in AXES else meaning[0], unit] = None
     return meanings, list(units)
 

@@ -28,6 +28,7 @@ _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
+_MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
 _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
 _REST_WINDOW = 0.1  # window for speeds [s]; up to twice the sample period of slow sensors
@@ -71,9 +72,9 @@ class _PointPlacement:
 
 @dataclass(frozen=True)
 class _GroupNoise:
-    """Noise standard deviation of a group (None if the recording states it), unit and source."""
+    """Noise standard deviation of a group (by joint if it differs, None if stated), unit and source."""
 
-    std: float | None
+    std: float | Mapping[str, float] | None
     unit: str
     reason: str
 
@@ -486,7 +487,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
         values = recorded.values_by_channel.get(channel)
         if values is not None:
             is_stated = is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions())
-            found[f"joints.{channel}"] = _channel_noise(recorded.t, values[:, at], least, unit, is_stated)
+            found[f"joints.{channel}"] = _channel_noise(recorded.t, values[:, at], least, unit, is_stated, joints)
     for key, group, kind in _mounted_channels(recording):
         values, stated = group.values_by_quantity[kind.quantity], group.noise_and_bias_stds_by_attribute
         columns = values.reshape(len(values), -1)
@@ -494,10 +495,14 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
     return found | {group.name: _point_noise(group) for group in recording.points}
 
 
-def _channel_noise(t: Array, values: Array, least: float, unit: str, is_stated: bool) -> _GroupNoise:
+def _channel_noise(
+    t: Array, values: Array, least: float, unit: str, is_stated: bool, joints: Sequence[str] = ()
+) -> _GroupNoise:
     if is_stated:
         return _GroupNoise(None, unit, _STATED_NOISE)
-    return _GroupNoise(max(least, *(noise_or_quantization_std(t, column) for column in values.T)), unit, _SEEN_NOISE)
+    sizes = [max(least, noise_or_quantization_std(t, column)) for column in values.T]
+    is_common = not joints or max(sizes) < _MAX_COMMON_NOISE_RATIO * min(sizes)
+    return _GroupNoise(max(sizes) if is_common else dict(zip(joints, sizes, strict=True)), unit, _SEEN_NOISE)
 
 
 def _point_noise(group: PointGroup) -> _GroupNoise:

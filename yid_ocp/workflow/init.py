@@ -318,6 +318,14 @@ def _number(value: float) -> str:
     return text if "e" not in text or "." in text.partition("e")[0] else text.replace("e", ".0e")
 
 
+def _number_or_numbers_by_name(value: float | Mapping[str, float]) -> str:
+    """Return one number if all are equal, else a mapping."""
+    if not isinstance(value, Mapping):
+        return _number(value)
+    rounded = {name: float(f"{number:.2g}") for name, number in value.items()}
+    return _value(rounded) if len(set(rounded.values())) > 1 else _number(next(iter(rounded.values())))
+
+
 def _wrapped_list(values: Iterable[str], column: int) -> str:
     """Return a YAML list; a long one has several lines, which begin at `column`."""
     rows, row = [], ""
@@ -365,16 +373,15 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
     for group, noise in proposal.noise_by_group.items():
         places, entries, said = proposal.point_placements.get(group, ()), [], f"noise {noise.reason}"
         if noise.std is not None:
-            entries, said = [f"std: {_number(noise.std)}"], f"noise of {noise.std:.2g} {noise.unit}, {noise.reason}"
+            size = "each joint" if isinstance(noise.std, Mapping) else f"{noise.std:.2g} {noise.unit}"
+            entries, said = [f"std: {_number_or_numbers_by_name(noise.std)}"], f"noise of {size}, {noise.reason}"
         elsewhere = (place for place in places if place.model_frame not in ("", place.point))
         if frames := {place.point: place.frame for place in elsewhere}:
             entries.append(f"frame_by_recorded_name: {_value(frames)}")
         told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
         if group == "joints.effort":
             if proposal.torque_bias_std and not proposal.is_identified_from_efforts_only:
-                biases = {joint: float(f"{std:.2g}") for joint, std in proposal.torque_bias_std.items()}
-                values = _number(next(iter(biases.values()))) if len(set(biases.values())) == 1 else _value(biases)
-                entries.append(f"bias_std: {values}")
+                entries.append(f"bias_std: {_number_or_numbers_by_name(proposal.torque_bias_std)}")
                 said += ". bias_std is the expected constant error of a torque (a guess, 1 % of its limit)"
             if told_by_points:
                 said = f"not used: the object is estimated without torques. use: true finds friction too; {said}"

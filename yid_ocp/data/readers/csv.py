@@ -18,7 +18,14 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import mean_sample_rate
-from yid_ocp.data.foreign_formats import AXES, UNIT_BY_WORD, ColumnMeaning, column_meanings, select_mocap_table_reader
+from yid_ocp.data.foreign_formats import (
+    AXES,
+    COUNTER_WORDS,
+    UNIT_BY_WORD,
+    ColumnMeaning,
+    column_meanings,
+    select_mocap_table_reader,
+)
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -400,7 +407,7 @@ def _meanings(
             raise DataError(what, where=where, allowed=allowed, hint=f"convert all of them to {both[0]} in the file")
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
-        if own is None and name and name not in given:
+        if own is None and name and name not in given and name.lower() not in COUNTER_WORDS:
             allowed = "a name such as t, q_<joint>, velocity_<joint>, effort_<joint>, position_command_<joint>, "
             allowed += "<point>_x or <link>_force_x, then the unit if it is not SI, such as [deg]"
             meaning = f"'{name}=position:JOINT'"
