@@ -28,6 +28,10 @@ _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
+_MAX_RIGID_MOTION, _MIN_AXIS_DISTANCE = (
+    1e-3,
+    0.01,
+)  # of a marker on the gripper: std in its frame, distance from the object [m]
 _MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
 _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
@@ -63,6 +67,7 @@ class _PointPlacement:
     frame: str
     reason: str
     position_std: float = 0.0  # of the point in that frame [m]; above 0 it has a frame of its own name there
+    xyz: tuple[float, ...] = ()  # position in that frame [m]; empty: its origin
 
     @property
     def model_frame(self) -> str:
@@ -362,16 +367,20 @@ def _places(
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
             frame, reason, std = "", "its place on the model is not known", 0.0
+            beside: tuple[float, ...] = ()
             if point in frames or (colon and owner in names and part.endswith("%")):
                 frame, reason = point, "their names are equal"
             elif point in names:
                 frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
                 straight = math.nan if parts is None else float(parts[i])
-                frame, reason = _near(poses, positions[:, i], straight, branches, holder)
+                if beside := _place_beside_object(poses, positions[:, i], branches):
+                    frame, reason = holder, f"it moves with {holder}, and is not on the object"
+                else:
+                    frame, reason = _near(poses, positions[:, i], straight, branches, holder)
                 if frame and len(branches) == 1:
                     std = (_ROUNDED_PLACE_STD if parts is None else _PLACE_STD) * branches[0].length
-            placed.append(_PointPlacement(point, frame, reason, std))
+            placed.append(_PointPlacement(point, frame, reason, std, beside))
         found[group.name] = tuple(placed)
     return found
 
@@ -399,6 +408,17 @@ def _parts_when_straight(positions: Array, poses: Array, branches: Sequence[Flex
     straight = end >= np.nanquantile(end, 1 - _STRAIGHTEST_FRACTION)
     ratio = apart[straight] / end[straight, None]
     return np.array([np.mean(own[np.isfinite(own)]) if np.isfinite(own).any() else math.nan for own in ratio.T])
+
+
+def _place_beside_object(poses: Array, position: Array, branches: Sequence[FlexibleSegment]) -> tuple[float, ...]:
+    """Position of a point in the holder's frame, if it is fixed there and away from the object's axis; else empty."""
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], position - poses[:, :3, 3])
+    local = local[np.isfinite(local).all(axis=1)]
+    if len(branches) != 1 or len(local) < 2 or local.std(axis=0).max() > _MAX_RIGID_MOTION:
+        return ()
+    x, y, z = (round(float(value), 4) for value in local.mean(axis=0))
+    is_away = max(math.hypot(x, y), -z) > _MIN_AXIS_DISTANCE and math.hypot(x, y, z) < branches[0].length / 4
+    return (x, y, z) if is_away else ()
 
 
 def _near(

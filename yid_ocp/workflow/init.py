@@ -345,7 +345,10 @@ def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> 
     marked = [place for places in of_points for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *(place.model_frame for place in marked), *proposal.grasps.values()])
     unsure = [(place, float(f"{place.position_std:.2g}")) for place in marked if place.position_std > 0]
-    uncertain = {place.point: {"parent_frame": place.frame, "position_std": std} for place, std in unsure}
+    uncertain = {
+        place.point: {"parent_frame": place.frame} | ({"xyz": place.xyz} if place.xyz else {}) | {"position_std": std}
+        for place, std in unsure
+    }
     dampings = [value for name, (value, _) in item.start_values.items() if name.endswith(".damping")]
     return {"dampings": dampings, "uncertain": uncertain, "points": wanted if set(wanted) > set(tips) else ()}
 
