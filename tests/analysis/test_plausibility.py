@@ -1,7 +1,5 @@
 """What a model says against a recording: Baxter holding the foam Y in MuJoCo, and a cable made up here."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

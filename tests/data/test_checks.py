@@ -1,7 +1,5 @@
 """What a recording says against itself: every fault is told by its cause, and a recording without one by none."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

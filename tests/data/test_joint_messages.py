@@ -1,7 +1,5 @@
 """Joint values of bags whose messages bring their own definitions: Franka's, ros2_control's, and any by its fields."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any

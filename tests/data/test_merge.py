@@ -1,7 +1,5 @@
 """Recordings of one run by several devices become one: clocks, offsets, what is said of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Direct-current motors, motors that are off, gains of a firmware, and friction in gears behind servos."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

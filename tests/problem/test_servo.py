@@ -1,7 +1,5 @@
 """Arms of position servos: commands instead of torques, rest under a command, slopes, effects on servos."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command `init` on made recordings: what it reads from them, what it writes, what it asks for and refuses."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence
