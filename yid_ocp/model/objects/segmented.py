@@ -175,7 +175,7 @@ class _SegmentedObject(MountedObjectBuilder):
     segment_key = "model.object.named_segments.{}"
     init_templates: ClassVar[Mapping[str, InitObjectFactory]] = {
         "cable": InitObjectFactory(8, _cable),
-        "beam": InitObjectFactory(6, _beam),
+        "beam": InitObjectFactory(12, _beam),
         "tree": InitObjectFactory(4, _tree, has_branches=True),
     }
 
