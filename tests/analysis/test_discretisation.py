@@ -170,6 +170,15 @@ def test_what_nothing_informs_stays_unknown():
     assert estimates_widened_by_discretisation_error(said, {"a": EstimateShiftByDiscretisation(5.0, 5.0)}, {}) == said
 
 
+def test_a_problem_takes_the_data_of_another_one(pendulum, twin):
+    clean = pendulum()
+    first, second = (pendulum(twin(clean, clean.initial_unknowns, seed)) for seed in (1, 2))
+    taken_over = discretisation.problem_with_data_of(first, second)
+    x = clean.initial_unknowns
+    np.testing.assert_array_equal(taken_over.evaluate(x).residual, second.evaluate(x).residual)
+    assert not np.array_equal(first.evaluate(x).residual, second.evaluate(x).residual)
+
+
 def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     """The problem's own answer with half the step is what one Gauss-Newton step says, to second order."""
     clean = pendulum()

@@ -1,7 +1,5 @@
 """Motor currents: a sensor that is one file; damping found from currents that another engine made."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import h5py

@@ -1,7 +1,5 @@
 """Wrist force/torque sensors and inertial units: MuJoCo's own sensors, joint efforts, derivatives and recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """What sensors read at a node, effects included, and its derivatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Frames on disk and their files, lenses, and what hides what."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -174,18 +174,24 @@ def stds_with_time_step_and_encoder_errors(
 
     `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Empty if `fine` fails.
     """
-    fine = fine.with_episodes(list(map(_with_data_of, fine.episodes, coarse.episodes)), ())  # corrected for links
-    made = _gauss_newton_step_in_finer_model(_FinerModel(fine), coarse, x, at_x)
+    refined = _FinerModel(problem_with_data_of(fine, coarse))  # corrected for links
+    made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
     if isinstance(made, str):
         return {}
     shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
     return {name: _std_with_shifts(std, [own[name] for own in shifts if name in own]) for name, std in stds.items()}
 
 
-def _with_data_of(episode: Episode, other: Episode) -> Episode:
-    pairs = zip(episode.measurements, other.measurements, strict=True)
-    same = (replace(a, value=b.value) if a.value.shape == b.value.shape else a for a, b in pairs)
-    return replace(episode, measurements=tuple(same))
+def problem_with_data_of(problem: EstimationProblem, other: EstimationProblem) -> EstimationProblem:
+    """Return the problem with the data of another one of the same recordings, where both have the same samples."""
+
+    def with_data_of(episode: Episode, other: Episode) -> Episode:
+        pairs = zip(episode.measurements, other.measurements, strict=True)
+        same = (replace(a, value=b.value) if a.value.shape == b.value.shape else a for a, b in pairs)
+        return replace(episode, measurements=tuple(same))
+
+    episodes = list(map(with_data_of, problem.episodes, other.episodes))
+    return problem.with_episodes(episodes, list(map(with_data_of, problem.held_out, other.held_out)))
 
 
 def _std_with_shifts(std: float, shifts: Iterable[float]) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from yid_ocp.analysis.discretisation import problem_with_data_of
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.events import EventSet, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import KEPT_HELD_OUT_FRACTIONS, AllCandidatesProblem
@@ -177,11 +178,11 @@ def _refitted_families(
     only: Sequence[str] = (),
 ) -> tuple[RefittedModel | None, list[_RefittedLaw]]:
     """Return a refit of the model without a law, and refits with each of the best laws, in one compiled step."""
-    # events are corrected and recordings truncated as in the diagnosis
+    # data are corrected for links and events, and recordings truncated, as in the diagnosis
     held_out = [] if search.problem.is_split_in_blocks else [e.recording for e in search.problem.problem.held_out]
     composed = AllCandidatesProblem.from_problem(problem, (*last.effects, *laws), held_out)
-    corrected, solver = problem_corrected_for_events(composed.problem, events), search.problem.refit_solver
-    composed = replace(composed, problem=corrected, refit_solver=solver)
+    corrected = problem_corrected_for_events(problem_with_data_of(composed.problem, last.problem), events)
+    composed = replace(composed, problem=corrected, refit_solver=search.problem.refit_solver)
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_HELD_OUT_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)
