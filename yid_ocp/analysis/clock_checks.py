@@ -11,6 +11,7 @@ account for correlated errors in blocks of time (Cameron, Gelbach, Miller 2011, 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -37,6 +38,8 @@ from yid_ocp.sensors import SensorOptions
 from yid_ocp.solvers import base as solvers
 
 PositionsAtTimesFunction = Callable[[Array], Array]  # N times on the joints' clock (N,) to points (N, np, 3) [m]
+
+log = logging.getLogger(__name__)
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 _MAX_EXPOSURE_TIME = 0.04  # of a sample: a slow camera knows the time of a frame better than its period [s]
@@ -247,8 +250,9 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
     advice += "again with --clock-offset FILE=SECONDS"
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
-        words = f"a fit finds time stamps of {name} {said} and corrects them. Their clock_offset_std is only "
-        words += f"{1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
+        words = f"a fit finds time stamps of {name} {said} and corrects them"
+        log.warning("recording '%s': %s", own, words)
+        words += f". Their clock_offset_std is only {1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
         if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
     return problem, issues

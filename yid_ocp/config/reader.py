@@ -325,7 +325,7 @@ class _Reader:
         advice = options.default_value_hint(self._name(path), options.Option(hint, default))
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
             given = match[2].strip()
-            factor = 1.0 if given == unit else _FACTORS.get((given, unit), 0.0) if match[1].count(".") < 2 else 0.0
+            factor = _FACTORS.get((given, unit), float(given == unit)) * (match[1].count(".") < 2)
             number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
             advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
         lists = map(options.variadic_tuple_entry_type, options.non_none_union_members(hint))
