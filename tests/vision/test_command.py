@@ -81,7 +81,7 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
         (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_mean_surface_distance_in_radii'"),
         (["track.options.filters.robot_padding=-1"], "robot_padding is -1"),
-        (["model.arms.mode=prescribed", "track.frames_path=null"], "needs driven joints, and the model has none"),
+        (["model.arms.mode=prescribed", "track.frames_path=null"], "needs model.arms.mode: driven"),
     ],
 )
 def test_wrong_input_is_said_and_leaves_nothing(printed, config, tmp_path, settings, message):
