@@ -1,7 +1,5 @@
 """A payload: inverse dynamics beside Pinocchio's, the link's inertia stays positive, where it is looked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

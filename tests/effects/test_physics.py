@@ -1,7 +1,5 @@
 """Each effect does what its equation says, on systems small enough to be worked out by hand."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import partial

@@ -1,7 +1,5 @@
 """Recordings under effects: inputs corrected, samples shifted; all effects at once: slopes, nothing at neutral."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace

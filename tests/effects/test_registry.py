@@ -1,7 +1,5 @@
 """Names, places, bounds and reports of effects, and what is said to whoever asks for what there is not."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """Flexible objects: lengths, stiffnesses, inertias, rest shapes, what is refused; the paper's Y and a tapered rod."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trees of bodies: hung on frames, merged, given more frames; points named by arc length; rotations."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """MJCF files as robots: mass matrix and bias against MuJoCo's own, and what is left out is said."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

@@ -206,6 +206,17 @@ def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path
         assert (model.object.mount.parent_frame, model.arms.locked_joints) == (holder, locked)
 
 
+def test_a_marker_beside_the_object_has_its_measured_place_on_the_gripper(bench: Path) -> None:
+    made, place = moved(SHORT), (0.03, -0.02, 0.01)
+    roll, pitch = made.joints.position.T
+    held = (turned(0, roll) @ turned(1, pitch)) @ place
+    points = np.concatenate([made.points[0].position, held[:, None]], axis=1)
+    group = replace(made.points[0], names=("m1", "m2", "hand"), position=points)
+    model = proposed(replace(made, points=(group,))).model
+    frame = model.frames["hand"]
+    assert (frame.parent_frame, frame.xyz) == (model.object.mount.parent_frame, pytest.approx(place, abs=1e-4))
+
+
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
     run = proposed(moved(SHORT, parts=(), effort=True), *beam)
