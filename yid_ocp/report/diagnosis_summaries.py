@@ -551,7 +551,9 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
-    yield SummaryStatement(said if lost else "The file has all listed parts." if entries else "", "conclusion")
+    yield SummaryStatement(
+        said if lost else "The file has all parts of the model that are listed below." if entries else "", "conclusion"
+    )
     gate = manifest["gate"] or {}
     yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate))
     if unknown := manifest["unknown"]:
@@ -582,8 +584,10 @@ def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
         text = f"In MuJoCo, the file {'reproduces' if is_good else 'does not reproduce'} the {held}: the largest error"
         yield f"{text} (of {worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
         if not is_good and "joints.position" in gate["channels"]:  # arms move by their torques
-            text = "Errors of recorded torques can cause this too. To exclude them, solve and export again with"
-            yield f"{text} --set model.arms.mode=prescribed, which moves the arms as measured."
+            text = (
+                "Errors of recorded torques, which move the arms here, can be the cause. To exclude them, run `yid-ocp "
+            )
+            yield f"{text}solve` with --set model.arms.mode=prescribed (arms move as measured), and export that run."
     if (fall := gate["fall"]) is not None:
         change = f"{100 * abs(fall):.3g} % {'larger' if fall < 0 else 'smaller'}"
         yield f"In MuJoCo, the error beyond noise on {held} is {change} than with the initial values."

@@ -465,8 +465,10 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows += [(*cells, ", ".join(own) * (len(own) < len(result["recordings"]))) for cells, own in noise.items()]
     yield SummaryTable(rows, "Noise of the readings")
     share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
-    said = f"A fit assumes {1 / share:.3g} times this std for model error (diagnosis.noise_fraction_of_stated_std)."
-    yield said if share < 1 else ""
+    said = (
+        f"A fit uses {1 / share:.3g} times this std, because errors of the model are larger than the noise. This is a "
+    )
+    yield f"{said}setting, not a fault: diagnosis.noise_fraction_of_stated_std." if share < 1 else ""
     told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
     yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]

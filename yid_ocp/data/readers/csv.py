@@ -378,7 +378,8 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
                 allowed = "a number; empty cells if no joint, or the whole point or sensor, was measured at this time"
                 allowed = "seconds, or a time stamp such as 2025-03-04T10:20:30.5Z" if meaning[0] == "t" else allowed
                 what = f"the cell '{cell}' in column '{name}' is not a number"
-                hint = f"correct the cell{_OR_SKIP}, or leave the column out: --columns '{name}=skip'"
+                hint = f"correct the cell{_OR_SKIP}"
+                hint += f", or leave the column out: --columns '{name}=skip'" if meaning[0] != "t" else ""
                 raise DataError(what, where=where, allowed=allowed, hint=hint) from error
     return numbers
 
@@ -395,7 +396,10 @@ def _meanings(
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
-            raise DataError(f"there is no column '{key}'", where=where, **unknown_name_error_arguments(key, header))
+            said = unknown_name_error_arguments(key, header)
+            if key.isdigit():  # the meanings are given in order
+                said["hint"] = f"name the columns, as in --columns '{header[0]}=t'; in order needs --no-header"
+            raise DataError(f"there is no column '{key}'", where=where, **said)
         given |= {name: meaning.replace("*", own.group(1)) if "*" in key else meaning for name, own in found.items()}
     meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
     by_name, stated = column_meanings(header, _COMPONENTS)
