@@ -251,10 +251,13 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
     for (i, name), (shift, std) in late.items():
         own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
         words = f"a fit finds time stamps of {name} {said} and corrects them"
-        log.warning("recording '%s': %s", own, words)
-        words += f". Their clock_offset_std is only {1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
-        if (ratio := abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)) > 1:
+        ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
+        if ratio > 1:
+            words += f". Their clock_offset_std is only {1e3 * std:.3g} ms "
+            words += f"({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
+        else:
+            log.warning("recording '%s': %s", own, words)
     return problem, issues
 
 

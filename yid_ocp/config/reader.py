@@ -82,8 +82,8 @@ def _read(path: Path) -> str:
         what, hint = error.what, error.hint
         if isinstance(error.__cause__, FileNotFoundError):
             what = "there is no such configuration file"
-            hint = "correct the path, or write a configuration: yid-ocp init ROBOT RECORDING --out CONFIG.yaml"
-            hint = nearest_file_question(path, "*.y*ml") or hint
+            init = "correct the path, or write a configuration: yid-ocp init ROBOT RECORDING --out CONFIG.yaml"
+            hint = nearest_file_question(path, "*.y*ml") or init
         raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
 
 

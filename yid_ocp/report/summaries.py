@@ -267,8 +267,10 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", "95 % interval", "verdict")]
     for name, entry in parameters.items():
         std = entry["std_relative"]
-        spread = "no limit" if std is None else f"{100 * std:.3g}" if std < 9.995 else "above 1000"
-        interval = _interval_cell(entry, None if is_initial or std is None else std * abs(entry["value"]))
+        spread, absolute = "no limit", None
+        if std is not None:
+            spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", std * abs(entry["value"])
+        interval = _interval_cell(entry, None if is_initial else absolute)
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
@@ -552,7 +554,9 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
         sight = "" if seen is None or not rows else observed
         moves, small = [own[key] and own[key] * change for key in ("along", "moved")], f"< {_NEGLIGIBLE_STDS:g}"
         along, one = ("" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
-        is_visible = "" if moves[0] is None else "yes" if moves[0] >= _MIN_VISIBLE_CHANGE else "no"
+        is_visible = ""
+        if moves[0] is not None:
+            is_visible = "yes" if moves[0] >= _MIN_VISIBLE_CHANGE else "no"
         moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, own["best"]))
         equations.append((name, _row_names_text(rows), sight, one))
     return moved, equations
