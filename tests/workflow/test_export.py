@@ -59,19 +59,18 @@ def exported(printed):
 
 def gate_holds(gate) -> None:
     assert (gate["status"], gate["which"]) == ("done", "held_out")
-    assert gate["fall"] >= 0.8
-    angles, arm = gate["channels"]["joints.position"], gate["channels"]["points_arm.w_T2"]
-    # the angles' noise is small beside their error: there the plain error falls as far
-    assert angles["after"] <= 0.2 * angles["before"]
-    assert arm["after"] == pytest.approx(arm["noise"], rel=0.1)
-    assert arm["before"] > 4 * arm["noise"]
+    times_noise = {
+        name: (own["before"] / own["noise"], own["after"] / own["noise"]) for name, own in gate["channels"].items()
+    }
+    assert all(after < 1.3 for _, after in times_noise.values())
+    assert min(times_noise["joints.effort"][0], times_noise["points_camera.w_T3"][0]) > 2
 
 
 @pytest.mark.slow
 def test_the_embedded_diagnosis_in_mujoco(printed, found, tmp_path) -> None:
     out = tmp_path / "y.xml"
     told = printed("export", found, "--out", out)
-    parts = "kelvin_voigt@T1    exact", "value of T2.twist, T3.twist", "T3.twist           exact, value unknown"
+    parts = "kelvin_voigt@T1    exact", "value of T2.twist, T3.twist", "T3.twist           exact        unreliable"
     assert [part for part in parts if part not in told] == []
     manifest = json.loads(out.with_name(f"{out.name}.manifest.json").read_text())
     gate_holds(manifest["gate"])

@@ -10,7 +10,7 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Protocol, get_args
 
@@ -28,6 +28,7 @@ from yid_ocp.virtual.mjcf import import_mujoco, mujoco_model_from_mjcf_text, muj
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
 _TRACKING_BANDWIDTH = 25.0  # bandwidth of the joint controller [rad/s]; a 10 ms hold leaves it well damped
+_REPLAY_BANDWIDTH = 100.0  # the same for replays, whose controller acts at every step [rad/s]
 _HOLD_STIFFNESS = 2e3  # of driven joints while settling; explicit integration is stable on the lightest wrist [N m/rad]
 _HOLD_DAMPING = 60.0  # [N m s/rad]
 _SETTLING_FACTOR = 10.0  # on the object's damping: shortens settling without changing the equilibrium
@@ -256,8 +257,14 @@ class TrackingController:
     Before the motion the scene is at equilibrium, held by the torques `balance` (nu,) [N m].
     """
 
-    def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion, balance: Array) -> None:
-        self._scene, self._motion = scene, motion
+    def __init__(
+        self,
+        scene: MujocoModelAndState,
+        motion: JointOffsetMotion,
+        balance: Array,
+        bandwidth: float = _TRACKING_BANDWIDTH,
+    ) -> None:
+        self._scene, self._motion, self._bandwidth = scene, motion, bandwidth
         self._free = copy.copy(scene.model)
         self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self._shadow = scene.mujoco.MjData(self._free)
@@ -270,8 +277,8 @@ class TrackingController:
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
-        demand = acceleration + 2 * _TRACKING_BANDWIDTH * (velocity - data.qvel[driven])
-        demand += _TRACKING_BANDWIDTH**2 * (reference - data.qpos[driven])
+        demand = acceleration + 2 * self._bandwidth * (velocity - data.qvel[driven])
+        demand += self._bandwidth**2 * (reference - data.qpos[driven])
         torque = np.asarray(self._load + self._arm_torque(reference, velocity, demand))
         data.qfrc_applied[driven] = torque
         return torque
@@ -387,11 +394,9 @@ def _play(
     return SimulationResult(t, np.array(q), np.array(v), effort, np.array(points), frame_times, frame_points)
 
 
-REPLAY_FEEDBACK_BANDWIDTH = 5.0  # against drift of driven joints; low, so that recorded torque dominates [rad/s]
 _SMOOTHING_SAMPLES = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
-_AT_ENDS = 0.2  # duration at both ends of the replay in which efforts of prescribed joints are not compared [s]
-_INERTIA_EVERY = 20  # steps after which the mass matrix is computed again; it changes slowly
+_AT_ENDS = 0.2  # duration at both ends of the replay in which efforts are not compared [s]
 
 
 @dataclass(frozen=True)
@@ -402,23 +407,16 @@ class ReplayErrorAgainstRecording:
     noise_rms: float  # root mean square difference that sensor noise alone causes; zero if the noise is not recorded
     unit: str
 
-    @property
-    def rmse_beyond_noise(self) -> float:
-        """The root mean square difference that noise does not explain: sqrt(rmse^2 - noise_rms^2), at least zero."""
-        return float(np.sqrt(max(self.rmse**2 - self.noise_rms**2, 0.0)))
-
 
 def replay_mismatch_by_channel(
     text: str, system: System, recording: Recording
 ) -> dict[str, ReplayErrorAgainstRecording]:
     """Replay a recording in MuJoCo and return the errors of the replay by channel. `text` is the model in MJCF.
 
-    `text` comes from `mujoco_xml` with actuators. Driven joints get the recorded torque plus weak feedback to the
-    recorded angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which small torque errors would let the arm drift away.
-    Position servos get their recorded commands only. Prescribed joints follow the recorded angles, and the torque that
-    this requires is compared with the recorded torque.
+    `text` comes from `mujoco_xml` with actuators. Position servos get their recorded commands only. Other joints follow
+    the recorded angles, and the torque that this requires is compared with the recorded torque.
 
-    Keys: `joints.position` (all driven joints together) [rad] or `joints.effort` (all prescribed joints) [N m], and
+    Keys: `joints.position` (all position servos) [rad] or `joints.effort` (all other moved joints) [N m], and
     `GROUP.POINT` for every point [m]. Raises `ModelError` if channels are missing or the simulation fails, and
     `DataError` if MuJoCo is not installed.
     """
@@ -436,7 +434,6 @@ def replay_mismatch_by_channel(
         what, where = f"the recording has no {words} of the driven joints", f"recording '{recording.name}': joints"
         raise ModelError(what, where=where, allowed=f"the channel {quantity}", hint=f"import it again with {words}")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
-    effort = None if joints.effort is None else joints.effort[:, columns]
     scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.moved_joint_ids] = position[:_START].mean(axis=0)
@@ -447,12 +444,7 @@ def replay_mismatch_by_channel(
     balance = settle_and_return_holding_torques(scene, np.array(model.dof_damping))
     noisy = joints.position_std is None or bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHING_SAMPLES if noisy else 0.0)
-    if system.driven:
-        return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
-    controller = TrackingController(scene, path, balance)
-    scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
-    played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_control_input(now))
-    return _errors(system, recording, joints, columns, played)
+    return _errors(system, recording, joints, columns, _followed(scene, path, balance, joints, columns))
 
 
 class _Path:
@@ -461,9 +453,14 @@ class _Path:
     def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
         from scipy.ndimage import gaussian_filter1d  # slow to import
 
+        def spline(values: Array) -> CubicSpline:
+            return CubicSpline(t, gaussian_filter1d(values, smoothed, axis=0) if smoothed else values)
+
         self.joints, self._start, self._last = joints, position[:_START].mean(axis=0), float(t[-1])
-        spline = CubicSpline(t, gaussian_filter1d(position, smoothed, axis=0) if smoothed else position)
-        self._values = [spline, spline.derivative(1), spline.derivative(2)]
+        self._values = [spline(position), spline(position).derivative(1), spline(position).derivative(2)]
+        one = np.eye(1, len(t), len(t) // 2)[0]
+        # std of the second derivative if white noise of std 1 is in the angles [1/s^2]
+        self.acceleration_per_noise = float(np.linalg.norm(spline(one).derivative(2)(t)))
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
         angle, velocity, acceleration = (np.asarray(value(min(t, self._last))) for value in self._values)
@@ -478,6 +475,7 @@ class _Played:
     values: Array
     points: Array
     diverged_at: str
+    value_std: Array | float = 0.0  # of the values, from the noise of recorded angles; shape (nj,) or scalar
 
 
 def _step_times(scene: MujocoModelAndState, end: float) -> Array:
@@ -500,27 +498,38 @@ def _played(scene: MujocoModelAndState, end: float, control: Callable[[int, floa
     return _Played(times, values, points, _lost(scene) or ("" if is_finite else "efforts"))
 
 
-def _driven(scene: MujocoModelAndState, path: _Path, t: Array, effort: Array | None) -> _Played:
-    assert effort is not None
-    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.moved_joint_ids
-    start = np.array(data.qpos[at])
+def _followed(
+    scene: MujocoModelAndState, path: _Path, balance: Array, joints: JointGroup, columns: list[int]
+) -> _Played:
+    """Replay of the recorded angles. Its values are the torques that this requires, as recorded at each joint.
+
+    What actuators of the model make of recorded efforts (gains, lags and delays) is taken from the torque, and the
+    efforts are added.
+    """
+    model, data, at, t = scene.model, scene.data, scene.moved_joint_ids, joints.t - joints.t[0]
+    controller = TrackingController(scene, path, balance, _REPLAY_BANDWIDTH)
+    data.qvel[at] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
+    inertia = np.zeros((model.nv, model.nv))
+    for column, unit in zip(inertia, np.eye(model.nv), strict=True):
+        scene.mujoco.mj_mulM(model, data, column, unit)
+    std = np.broadcast_to(0.0 if joints.position_std is None else joints.position_std, len(joints.names))[columns]
+    noise = np.sqrt(inertia[np.ix_(at, at)] ** 2 @ (path.acceleration_per_noise * std) ** 2)
+    if not model.nu:
+        played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_control_input(now))
+        return replace(played, value_std=noise)
+    assert joints.effort is not None
+    effort = joints.effort[:, columns]
     if model.na:  # lagging torques start at the first recorded value
         data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
     _initialize_actuator_history(scene, effort[0])
-    inertia = np.zeros((model.nv, model.nv))
 
-    def control(k: int, now: float) -> None:
-        if k % _INERTIA_EVERY == 0:
-            mujoco.mj_forward(model, data)
-            for column, unit in zip(inertia, np.eye(model.nv), strict=True):
-                mujoco.mj_mulM(model, data, column, unit)
-        offset, velocity, _ = path.offset_and_derivatives(now)
-        demand = REPLAY_FEEDBACK_BANDWIDTH**2 * (start + offset - data.qpos[at])
-        demand += 2 * REPLAY_FEEDBACK_BANDWIDTH * (velocity - data.qvel[at])
+    def control(k: int, now: float) -> Array:
         data.ctrl[:] = effort[np.searchsorted(t, now + 1e-9, side="right") - 1]
-        data.qfrc_applied[at] = inertia[np.ix_(at, at)] @ demand
+        missing = controller.apply_and_return_control_input(now) - data.qfrc_actuator[at]
+        data.qfrc_applied[at] = missing
+        return np.asarray(data.ctrl + missing)
 
-    return _played(scene, t[-1], control)
+    return replace(_played(scene, t[-1], control), value_std=noise)
 
 
 def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: Array) -> _Played:
@@ -545,14 +554,15 @@ def _errors(
         raise ModelError(what, where=where, allowed="finite positions and efforts", hint=hint)
     found, t = dict[str, ReplayErrorAgainstRecording](), joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9
-    if not system.driven:
+    if not system.servos:
         inside &= (t >= _AT_ENDS) & (t <= t[-1] - _AT_ENDS)
-    name, unit = ("joints.position", "rad") if system.driven else ("joints.effort", "N m")
-    said, noise = (getattr(joints, name.removeprefix("joints.") + part) for part in ("", "_std"))
+    name, unit = ("joints.position", "rad") if system.servos else ("joints.effort", "N m")
+    said, *stds = (getattr(joints, name.removeprefix("joints.") + part, None) for part in ("", "_std", "_bias_std"))
     if said is not None and inside.any():
         error = float(np.sqrt(np.mean((_at(t[inside], played.t, played.values) - said[inside][:, columns]) ** 2)))
-        level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
-        found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(np.mean(level**2))), unit)
+        known = [np.broadcast_to(std, len(joints.names))[columns] for std in stds if std is not None]
+        variance = np.mean(sum((level**2 for level in known), played.value_std**2))
+        found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(variance)), unit)
     for group in recording.points:
         t = group.t - joints.t[0]
         for i, point in enumerate(group.names):

@@ -276,16 +276,13 @@ def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> d
         after = _replayed(calibrated.text("mjcf", system), system, recordings, progress, 1)
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": ". Try: ".join(filter(None, (error.what, error.hint)))}
-    channels = {}
-    for name, mismatch in after.items():
-        own = attributes_to_dict(mismatch, "unit noise=noise_rms after=rmse")
-        channels[name] = own | {"before": before[name].rmse, "fall": _fall([(before[name], mismatch)])}
+    kept = "unit noise=noise_rms after=rmse"
+    channels = {n: attributes_to_dict(own, kept) | {"before": before[n].rmse} for n, own in after.items()}
     return {
         "status": "done",
         "which": which,
         "recordings": [recording.name for recording in recordings],
         "channels": channels,
-        "fall": _fall([(before[name], error) for name, error in after.items()]),
     }
 
 
@@ -331,12 +328,6 @@ def _replayed(
         rmse, noise = np.sqrt(np.mean([(error.rmse**2, error.noise_rms**2) for error in errors], axis=0))
         together[name] = ReplayErrorAgainstRecording(float(rmse), float(noise), errors[0].unit)
     return together
-
-
-def _fall(pairs: Sequence[tuple[ReplayErrorAgainstRecording, ReplayErrorAgainstRecording]]) -> float | None:
-    """Return the mean relative fall of errors beyond noise, from pairs (before, after). None without such errors."""
-    parts = [1 - a.rmse_beyond_noise / b.rmse_beyond_noise for b, a in pairs if b.rmse_beyond_noise > 0]
-    return sum(parts) / len(parts) if parts else None
 
 
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
