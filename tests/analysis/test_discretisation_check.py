@@ -2,11 +2,13 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from made_cross import TRUTH, configuration, record
 
 import yid_ocp as yid
+from yid_ocp.analysis.discretisation import stds_with_discretisation_and_encoder_errors
 from yid_ocp.config.reader import load_config
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
 from yid_ocp.virtual.injected import InjectedEffect
@@ -67,6 +69,14 @@ def test_python_and_shell_say_the_same(coarse):
         assert (entry.verdict, entry.value) == (said["verdict"], pytest.approx(said["value"], rel=1e-6))
         assert entry.std == pytest.approx(said["std"], rel=1e-6)
     assert solution.std["north.bend"] > 5 * solution.checks.data_std["north.bend"]
+    fine, known = (
+        problem.with_time_step(problem.step.time_step / 2),
+        (solution.evaluation, solution.checks.data_std, ()),
+    )
+    of_diagnosis = partial(stds_with_discretisation_and_encoder_errors, fine, solution.problem, solution.x, *known)
+    std, counted = of_diagnosis(False)
+    assert (std["north.bend"], counted) == (pytest.approx(solution.std["north.bend"], rel=1e-6), ("time_step", "links"))
+    assert of_diagnosis(True)[1] == ("time_step",)  # the data are without the error of links
     assert "without the error" not in repr(solution)
     assert len(solution.checks.held_out_predictions) == len(problem.held_out)
     # where the model cannot be refined, the print says what its ± leaves out

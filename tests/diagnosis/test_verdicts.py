@@ -143,7 +143,7 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     assert ("the nominal model at 0.02 s" in names) is is_finer
     fit, true = finding.final_model, {"tau_c": 0.1, "damping": 0.05}
     wrong = [name for name, x in fit.values.items() if abs(x - true[name.rpartition(".")[2]]) > 2 * fit.std[name]]
-    assert (wrong, finding.has_time_step_error_in_std) == ([], True)  # ± counts the step that was used
+    assert (wrong, finding.errors_in_std) == ([], ("time_step",))  # ± counts the step that was used
 
 
 @pytest.mark.usefixtures("without_law")

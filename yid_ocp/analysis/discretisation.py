@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 
 import casadi as ca
@@ -81,6 +82,10 @@ class _FinerModel:
             # a neutral effect of the coarse model may add a joint
             fine[[tree.joint_index(part) for part in parts if part in tree.joint_names]] = angle / len(parts)
         return fine
+
+
+def _has_divisible_links(problem: EstimationProblem) -> bool:
+    return bool(problem.options.divided_links_model and problem.system.segment_layouts)
 
 
 def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
@@ -167,19 +172,37 @@ def predicted_chi2_fall_at_finer_step(
     return sum(max(old - new, 0.0) for old, new in zip(before, after, strict=True))
 
 
-def stds_with_time_step_and_encoder_errors(
-    fine: EstimationProblem, coarse: EstimationProblem, x: Array, at_x: Evaluation, stds: Mapping[str, float]
-) -> dict[str, float]:
-    """Add the errors of the time step and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
+def stds_with_discretisation_and_encoder_errors(
+    fine: EstimationProblem,
+    coarse: EstimationProblem,
+    x: Array,
+    at_x: Evaluation,
+    stds: Mapping[str, float],
+    effects: Sequence[EffectBase],
+    is_corrected_for_links: bool,
+) -> tuple[dict[str, float], tuple[RefinementKind, ...]]:
+    """Add the errors of discretisation and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
 
-    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. Empty if `fine` fails.
+    `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. The error of the links,
+    in a model with the `effects` of the fit, is added if `solve` does so too and the data are not corrected for it.
+    Also returns which refinements were made.
     """
-    refined = _FinerModel(problem_with_data_of(fine, coarse))  # corrected for links
-    made = _gauss_newton_step_in_finer_model(refined, coarse, x, at_x)
-    if isinstance(made, str):
-        return {}
-    shifts = made[0], _shifts_by_more_encoder_noise(coarse, x, at_x)
-    return {name: _std_with_shifts(std, [own[name] for own in shifts if name in own]) for name, std in stds.items()}
+    has_links = "links" in coarse.options.checked_discretisations and _has_divisible_links(coarse)
+    refinements: dict[RefinementKind, Callable[[], _FinerModel]] = {
+        "time_step": lambda: _FinerModel(problem_with_data_of(fine, coarse)),  # corrected for links
+        "links": lambda: _refined_problem(coarse, "links", effects=effects),
+    }
+    if is_corrected_for_links or not has_links:
+        del refinements["links"]
+    shifts, counted = [_shifts_by_more_encoder_noise(coarse, x, at_x)], list[RefinementKind]()
+    for kind, refined in refinements.items():
+        with contextlib.suppress(YidError):
+            made = _gauss_newton_step_in_finer_model(refined(), coarse, x, at_x)
+            if not isinstance(made, str):
+                shifts.append(made[0])
+                counted.append(kind)
+    own = {name: _std_with_shifts(std, [part[name] for part in shifts if name in part]) for name, std in stds.items()}
+    return own, tuple(counted)
 
 
 def problem_with_data_of(problem: EstimationProblem, other: EstimationProblem) -> EstimationProblem:
@@ -213,7 +236,7 @@ def problem_data_corrected_for_few_links(
     of a fit; `at_x` is its evaluation at the fit `x` (nx,), with Jacobian. A large change is computed at parameters
     refitted in the finer model. None if a refit would not lower r'r by `min_chi2_decrease`, or if this is impossible.
     """
-    if problem.has_process_noise or not (problem.options.divided_links_model and problem.system.segment_layouts):
+    if problem.has_process_noise or not _has_divisible_links(problem):
         return None
     guesses, before = at_x.equilibrium_guesses, at_x.residual
     try:
@@ -342,7 +365,7 @@ def parameter_shifts_at_finer_discretisation(
     notes, settings = list[str](), finer_setting_texts(problem)
     for key in kinds:
         words = _REFINEMENT_DESCRIPTIONS[key]
-        if key == "links" and (problem.options.divided_links_model is None or not problem.system.segment_layouts):
+        if key == "links" and not _has_divisible_links(problem):
             continue
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +32,7 @@ from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers import base as solvers
 from yid_ocp.solvers.base import IterationCallback, Solver
 
-UNCOUNTED_ERROR_TEXTS = {"links": "from the number of links", "time_step": "from the time step"}
+_ERROR_TEXTS = {"links": "from the number of links", "time_step": "from the time step"}
 
 
 def solve(
@@ -124,12 +124,20 @@ def add_discretisation_errors(
     sizes = uncertainty.typical_parameter_magnitudes(problem, solution.x)
     inflated = discretisation.estimates_widened_by_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
-    uncounted = tuple(words for kind, words in UNCOUNTED_ERROR_TEXTS.items() if kind not in checked)
-    if not problem.system.segment_layouts or ("links" not in kinds and problem.options.divided_links_model):
-        uncounted = tuple(words for words in uncounted if words != UNCOUNTED_ERROR_TEXTS["links"])
+    uncounted = uncounted_error_texts(problem, checked)
     notes = [*(() if solution.checks is None else solution.checks.notes), *notes]
     checks = uncertainty.EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=tuple(notes))
     return replace(solution, parameters=inflated), replace(checks, uncounted_errors=uncounted)
+
+
+def uncounted_error_texts(problem: EstimationProblem, counted: Collection[str]) -> tuple[str, ...]:
+    """Return the errors of the discretisation that standard deviations leave out. `counted` has the counted ones.
+
+    The error of links is not named where links can be divided, but are not by `checked_discretisations`.
+    """
+    can_divide, chosen = bool(problem.options.divided_links_model), problem.options.checked_discretisations
+    without = {"links"} if not problem.system.segment_layouts or (can_divide and "links" not in chosen) else set()
+    return tuple(words for kind, words in _ERROR_TEXTS.items() if kind not in {*counted, *without})
 
 
 def _checked_solution_and_issues(

@@ -43,6 +43,7 @@ from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
 from yid_ocp.inference.uncertainty import noise_only_covariance_sqrt, null_tests_of_fit
 from yid_ocp.integrator.compiled import MAX_BATCHED_COLUMNS
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
@@ -365,15 +366,16 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         smoothed = seen.smoothed or smoother.smooth_unknown_forces_and_biases(*nominal.at_estimates, least)
         where = rest = smoother.gap_locations_by_smoother_evidence(smoothed)
     search.record_stage_end_time("localisation")
-    remaining, events, is_counted = evidence.nominal_held_out_test, seen.events, False
+    remaining, events, counted = evidence.nominal_held_out_test, seen.events, tuple[RefinementKind, ...]()
     accepted = judged.accepted_selected_effects
     last = [nominal, *(entry.refitted_model for entry in accepted)][-1]
     assert isinstance(last, RefittedModel)
     final = reevaluate_refit_with_all_candidates(search.problem, last)
     if judged.verdict in ("no_gap", "effect", "confusable"):
         fine = _at_finer_step(search, final, events)
-        std = discretisation.stds_with_time_step_and_encoder_errors(fine, *final.at_estimates, final.std)
-        final, is_counted = replace(final, std=final.std | std), bool(std)
+        known = *final.at_estimates, final.std, final.effects, seen.is_corrected_for_links
+        std, counted = discretisation.stds_with_discretisation_and_encoder_errors(fine, *known)
+        final = replace(final, std=std)
     if not accepted:
         evidence = replace(evidence, nominal_model=final)
     else:
@@ -420,7 +422,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
         is_corrected_for_links=seen.is_corrected_for_links,
-        has_time_step_error_in_std=is_counted,
+        errors_in_std=counted,
         law=law,
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))

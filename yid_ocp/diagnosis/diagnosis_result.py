@@ -20,6 +20,7 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.files import attributes_to_dict, to_json_types
 from yid_ocp.inference import null_test
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
+from yid_ocp.problem.options import RefinementKind
 
 _EFFECT_KEYS = "kind location"
 _PLACE_KEYS = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
@@ -53,7 +54,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     # [s]; they differ if the stated step's error was part of the gap
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
-    has_time_step_error_in_std: bool = False  # whether this error was computed, for the final model
+    errors_in_std: tuple[RefinementKind, ...] = ()  # of the discretisation, in the stds of the final model
     law: NonparametricLaw | None = None  # law of the gap, or of the gap that the effects leave
 
     def _summary(self) -> ReprTexts:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp import files
-from yid_ocp.analysis.estimation import UNCOUNTED_ERROR_TEXTS
+from yid_ocp.analysis.estimation import uncounted_error_texts
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import RunSettings
@@ -173,9 +173,8 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     lines += ["problem:", f"  time_step: {used:g}"] if used != stated else []
     copied = system, fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], estimates
     export = "export", folder, "--out", "model.xml"
-    has_links = bool(system.segment_layouts) and not finding.is_corrected_for_links
-    lacking = {"links": has_links, "time_step": not finding.has_time_step_error_in_std}
-    left_out = [UNCOUNTED_ERROR_TEXTS[kind] for kind, is_lacking in lacking.items() if is_lacking]
+    counted = [*finding.errors_in_std, *["links"] * finding.is_corrected_for_links]
+    left_out = uncounted_error_texts(fit.problem, counted)
     return prediction_outputs.copyable_estimate_texts(*copied, export, left_out, lines)
 
 
