@@ -217,6 +217,16 @@ def test_a_marker_beside_the_object_has_its_measured_place_on_the_gripper(bench:
     assert (frame.parent_frame, frame.xyz) == (model.object.mount.parent_frame, pytest.approx(place, abs=1e-4))
 
 
+@pytest.mark.parametrize(("axis", "rpy"), [(0, [0, np.pi / 2, 0]), (1, [-np.pi / 2, 0, 0]), (2, [0, 0, 0])])
+def test_an_object_is_mounted_along_the_axis_on_which_its_points_lie(bench: Path, axis: int, rpy: list[float]) -> None:
+    made = moved(SHORT)
+    roll, pitch = made.joints.position.T
+    along = (turned(0, roll) @ turned(1, pitch))[:, :, axis]
+    group = replace(made.points[0], position=np.array([0.5, 1.0])[None, :, None] * LENGTH * along[:, None])
+    mount = proposed(replace(made, points=(group,))).model.object.mount
+    assert mount.rpy == pytest.approx(rpy, abs=1e-4)
+
+
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
     beam = ("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05")
     run = proposed(moved(SHORT, parts=(), effort=True), *beam)

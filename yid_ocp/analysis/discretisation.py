@@ -35,6 +35,7 @@ _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
 EXTRAPOLATION_FACTOR = 2.0
 """Distance to many links, short steps or no encoder noise, over the shift of one refinement: m + m/2 + m/4 + ..."""
+_LEFT_AFTER_CORRECTION = 1 - 1 / EXTRAPOLATION_FACTOR  # of this distance, in data corrected by one refinement
 _N_NOISE_DRAWS = 6  # of encoder noise
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS = 3
@@ -184,22 +185,25 @@ def stds_with_discretisation_and_encoder_errors(
     """Add the errors of discretisation and of encoder noise to standard deviations of a fit `x` (nx,), as `solve` does.
 
     `fine` is the problem with half the time step, `at_x` the coarse evaluation with Jacobian. The error of the links,
-    in a model with the `effects` of the fit, is added if `solve` does so too and the data are not corrected for it.
-    Also returns which refinements were made.
+    in a model with the `effects` of the fit, is added if `solve` does so too. Of data that are corrected for it, a part
+    is left. Also returns which refinements were made.
     """
     has_links = "links" in coarse.options.checked_discretisations and _has_divisible_links(coarse)
     refinements: dict[RefinementKind, Callable[[], _FinerModel]] = {
-        "time_step": lambda: _FinerModel(problem_with_data_of(fine, coarse)),  # corrected for links
+        "time_step": lambda: _FinerModel(fine),
         "links": lambda: _refined_problem(coarse, "links", effects=effects),
     }
-    if is_corrected_for_links or not has_links:
+    if not has_links:
         del refinements["links"]
     shifts, counted = [_shifts_by_more_encoder_noise(coarse, x, at_x)], list[RefinementKind]()
     for kind, refined in refinements.items():
         with contextlib.suppress(YidError):
-            made = _gauss_newton_step_in_finer_model(refined(), coarse, x, at_x)
+            finer = refined()
+            finer = replace(finer, problem=problem_with_data_of(finer.problem, coarse))  # corrected ones
+            made = _gauss_newton_step_in_finer_model(finer, coarse, x, at_x)
             if not isinstance(made, str):
-                shifts.append(made[0])
+                part = _LEFT_AFTER_CORRECTION if kind == "links" and is_corrected_for_links else 1.0
+                shifts.append({name: part * move for name, move in made[0].items()})
                 counted.append(kind)
     own = {name: _std_with_shifts(std, [part[name] for part in shifts if name in part]) for name, std in stds.items()}
     return own, tuple(counted)

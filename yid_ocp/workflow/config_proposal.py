@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from scipy.ndimage import maximum_filter1d
+from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period, noise_or_quantization_std
@@ -28,12 +29,20 @@ _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
 _CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
-_MAX_RIGID_MOTION, _MIN_AXIS_DISTANCE = (
-    1e-3,
-    0.01,
-)  # of a marker on the gripper: std in its frame, distance from the object [m]
-_MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
+_MAX_RIGID_MOTION = 1e-3  # std of a marker in the frame of the gripper to which it is fixed [m]
+_MIN_AXIS_DISTANCE = 0.01  # distance of a marker on the gripper from the axis of the object [m]
+_MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
+_MOUNT_ROTATIONS = {
+    "z": (0.0, 0.0, 0.0),
+    "x": (0.0, 1.5708, 0.0),
+    "-x": (0.0, -1.5708, 0.0),
+    "y": (-1.5708, 0.0, 0.0),
+    "-y": (1.5708, 0.0, 0.0),
+    "-z": (3.1416, 0.0, 0.0),
+}
+"""Roll, pitch and yaw [rad] that turn the object, whose axis is z, to an axis of the frame that holds it."""
+_MIN_AXIS_COSINE = 0.8  # of the angle between an axis and the mean direction of points; rods sag, cables hang
 _JOINT_REST_SPEED, _POINT_REST_SPEED = 0.02, 0.03  # A joint [rad/s] or a point [m/s] slower than this is at rest
 _REST_WINDOW = 0.1  # window for speeds [s]; up to twice the sample period of slow sensors
 _MIN_FRICTION_TRAVEL = 0.02  # a joint that turns less than this does not inform its friction [rad]
@@ -94,6 +103,7 @@ class ProposedConfigChoices:
     locked_joints: Mapping[str, float]  # position of the fingers of a gripper, which rest [rad or m]
     arms: tuple[_ArmChain, ...]  # arms that hold the object; the first one carries its root
     holder_frame: str  # carries the object's root
+    holder_axis: str  # of that frame, along which the object leaves it, such as `-x`
     grasps: Mapping[str, str]  # point of the object by the frame that holds it
     arm_mode: str
     arm_mode_reason: str
@@ -112,6 +122,11 @@ class ProposedConfigChoices:
     is_effort_sampling_kind_unknown: bool  # whether efforts are recorded without it
     urdf_joint_damping: Mapping[str, float]  # above 0, by joint [N m s/rad]
     urdf_joint_friction: Mapping[str, float]  # above 0, by joint [N m]
+
+    @property
+    def mount_rpy(self) -> list[float]:
+        """Roll, pitch and yaw [rad] of the object in the frame that carries its root."""
+        return list(_MOUNT_ROTATIONS[self.holder_axis])
 
     @property
     def is_identified_from_efforts_only(self) -> bool:
@@ -167,6 +182,7 @@ def propose_config_choices(
     period = median_sample_period(recorded.t) or _MAX_TIME_STEP
     count = math.floor(_MAX_TIME_STEP / period + 1e-3)  # sample periods in a step; a slow clock's period is divided
     step = period * count if count else period / math.ceil(period / _MAX_TIME_STEP - 1e-3)
+    axis = "z" if standing or len(branches) != 1 else _holder_axis(tree, first, branches[0].length, holder)
     return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
@@ -174,12 +190,13 @@ def propose_config_choices(
         locked,
         tuple(arm for arm in arms if set(arm.joints) & set(joints)) or arms,
         holder,
+        axis,
         held,
         mode,
         why,
         "estimated" if moving else "equilibrium",
         moving or "all recordings begin at rest",
-        _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
+        _places(tree, first, branches, holder, axis, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
         float(f"{step:.3g}"),
         select_path_cutoff(recordings, joints if branches and mode == "prescribed" else ()),
@@ -350,7 +367,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
 
 
 def _places(
-    tree: Mechanism, recording: Recording, branches: Sequence[FlexibleSegment], holder: str, standing: bool
+    tree: Mechanism, recording: Recording, branches: Sequence[FlexibleSegment], holder: str, axis: str, standing: bool
 ) -> dict[str, tuple[_PointPlacement, ...]]:
     """Return the place of every point, by group: by its name or, if an arm holds the object, by its positions."""
     names = [branch.name for branch in branches]
@@ -374,7 +391,7 @@ def _places(
                 frame, reason = f"w_{point}", "the end of the segment of this name"
             elif not standing:
                 straight = math.nan if parts is None else float(parts[i])
-                if beside := _place_beside_object(poses, positions[:, i], branches):
+                if beside := _place_beside_object(poses, positions[:, i], branches, axis):
                     frame, reason = holder, f"it moves with {holder}, and is not on the object"
                 else:
                     frame, reason = _near(poses, positions[:, i], straight, branches, holder)
@@ -410,15 +427,41 @@ def _parts_when_straight(positions: Array, poses: Array, branches: Sequence[Flex
     return np.array([np.mean(own[np.isfinite(own)]) if np.isfinite(own).any() else math.nan for own in ratio.T])
 
 
-def _place_beside_object(poses: Array, position: Array, branches: Sequence[FlexibleSegment]) -> tuple[float, ...]:
+def _place_beside_object(
+    poses: Array, position: Array, branches: Sequence[FlexibleSegment], axis: str
+) -> tuple[float, ...]:
     """Position of a point in the holder's frame, if it is fixed there and away from the object's axis; else empty."""
-    local = np.einsum("nji,nj->ni", poses[:, :3, :3], position - poses[:, :3, 3])
+    local = _in_frame(poses, position[:, None])[:, 0]
     local = local[np.isfinite(local).all(axis=1)]
     if len(branches) != 1 or len(local) < 2 or local.std(axis=0).max() > _MAX_RIGID_MOTION:
         return ()
-    x, y, z = (round(float(value), 4) for value in local.mean(axis=0))
-    is_away = max(math.hypot(x, y), -z) > _MIN_AXIS_DISTANCE and math.hypot(x, y, z) < branches[0].length / 4
-    return (x, y, z) if is_away else ()
+    mean, direction = local.mean(axis=0), _mount_direction(axis)
+    along = float(mean @ direction)
+    is_away = max(float(np.linalg.norm(mean - along * direction)), -along) > _MIN_AXIS_DISTANCE
+    is_near = np.linalg.norm(mean) < branches[0].length / 4
+    return tuple(np.round(mean, 4).tolist()) if is_away and is_near else ()
+
+
+def _in_frame(poses: Array, positions: Array) -> Array:
+    """Positions (N, np, 3) in frames of the poses (N, 4, 4)."""
+    return np.einsum("nji,npj->npi", poses[:, :3, :3], positions - poses[:, None, :3, 3])
+
+
+def _mount_direction(axis: str) -> Array:
+    return np.asarray(Rotation.from_euler("xyz", _MOUNT_ROTATIONS[axis]).as_matrix()[:, 2])
+
+
+def _holder_axis(tree: Mechanism, recording: Recording, length: float, holder: str) -> str:
+    """Axis of the holder's frame nearest to the mean direction of points on a single segment; `z` if none is near."""
+    total, count = np.zeros(3), 0
+    for group in recording.points:
+        local = _in_frame(_poses(tree, recording, holder, group.t), group.position)
+        apart = np.linalg.norm(local, axis=2)
+        far = apart > length / 4  # nearer ones may be on the gripper
+        total, count = total + (local[far] / apart[far][:, None]).sum(axis=0), count + int(far.sum())
+    cosines = {axis: float(total @ _mount_direction(axis)) for axis in _MOUNT_ROTATIONS}
+    best = max(cosines, key=cosines.__getitem__)
+    return best if cosines[best] > _MIN_AXIS_COSINE * count else "z"
 
 
 def _near(

@@ -173,8 +173,7 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     lines += ["problem:", f"  time_step: {used:g}"] if used != stated else []
     copied = system, fit.problem.unpack_episode_unknowns(fit.unknowns, 0)[0], estimates
     export = "export", folder, "--out", "model.xml"
-    counted = [*finding.errors_in_std, *["links"] * finding.is_corrected_for_links]
-    left_out = uncounted_error_texts(fit.problem, counted)
+    left_out = uncounted_error_texts(fit.problem, finding.errors_in_std)
     return prediction_outputs.copyable_estimate_texts(*copied, export, left_out, lines)
 
 
