@@ -65,16 +65,17 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
-        predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
+        fit, notes = result["fit"], result.get("discretisation_notes", ())
         yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
-        is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
-        fit, causes = result["fit"], grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
+        gaps = [*_gap_sentences(result)] if fit["explains"] else []
+        is_safe = fit["explains"] and not notes and not gaps
+        causes = grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
         said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
         if said and "noise_overstated" in causes:
             said = "The stated noise is too large to test whether the model explains the recordings."
         still = " ".join(causes.get("weak_excitation", ()))
-        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *predicted)
+        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *gaps)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
@@ -127,7 +128,7 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     elif len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
     if lost:
-        steps["rank experiments that determine the missing parameters"] = "identifiability --what-if"
+        steps["rank experiments that determine the missing parameters (takes minutes)"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
     return steps
@@ -148,33 +149,20 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
     return interval_text(low if lower is None else max(low, lower), high if upper is None else min(high, upper))
 
 
-def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences that compare the held-out error of a group of channels with noise.
-
-    A group gets one if the model does not explain the fitted data, or its error is over twice that of noise.
-    """
+def _gap_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a sentence for each group of channels whose held-out error is over twice that of noise."""
     residuals = result["residuals"]
+    advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
     for group, channels in grouped((channel.rpartition(".")[0], channel) for channel in residuals).items():
-        unit, fitted = residuals[channels[0]]["unit"], _rms([residuals[c]["rmse"] for c in channels])
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
-        if noise is None or error is None or fitted is None:
-            continue
-        known = [entry["baselines"] for entry in entries]
-        names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
-        best = min((_rms([own[n][c] for own in known for c in channels]) or 0.0 for n in names), default=None)
-        sizes = error, fitted, noise, best
-        held, own, alone, guess = (" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in sizes)
-        text = (
-            f"The rms error of {group} is {held} on held-out and {own} on fitted recordings. Noise alone gives {alone}"
-        )
-        text += f", the best guess without a model {guess}." if guess else "."
-        advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
-        if not result["fit"]["explains"]:
-            yield text
-        elif error > MAX_NOISE_RATIO * noise:
-            yield f"{group} shows a gap. Before you use any value, {advice}. {text}"
+        if error and noise and error > MAX_NOISE_RATIO * noise:
+            held, alone = (
+                " ".join(value_text_and_display_unit(x, residuals[channels[0]]["unit"])) for x in (error, noise)
+            )
+            text = f"{group} shows a gap: its held-out rms error is {held}, and noise alone gives {alone}."
+            yield f"{text} Before you use any value, {advice}."
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -200,9 +188,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
     is_large = any(error > MAX_NOISE_RATIO * noise for error, noise in known if error and noise)
     said = "An error above twice that of noise alone shows an error of the model."
-    said = (
-        said if is_large else "No error exceeds twice that of noise alone, so the model predicts these recordings well."
-    )
+    said = said if is_large else "No error exceeds twice that of noise alone, so the model predicts them well."
     said += " Noise alone includes the effect of torque errors." * bool(result.get("torque_offsets"))
     yield said if known else ""
 
@@ -562,7 +548,8 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
             size = own["along"] * change
             along = f"{size:.3g}" if size > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
             is_visible = "yes" if size >= _MIN_VISIBLE_CHANGE else "no"
-        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, own["best"]))
+        best = own["best"] or "–" * (seen is not None)
+        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, best))
         equations.append((name, _row_names_text(rows), sight))
     return moved, equations
 

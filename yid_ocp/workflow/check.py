@@ -262,5 +262,5 @@ def _warn(found: dict[str, Any], when: str, remedy: str, rows: list[dict[str, An
     change = f"by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}"
     said = f"natural frequencies change {change}: {', '.join(moved)}. Only if your motions excite these vibrations, set"
     found["warnings"] += [f"{said} {remedy}"] if moved else []
-    fine = f"No natural frequency changes {change}, so this model is fine enough. "
+    fine = f"No natural frequency changes {change}, so this is fine enough. "
     found["message"] += fine * (not moved and bool(rows[-1]["hertz"]))
