@@ -467,7 +467,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with interruption.raise_on_termination_signals(), _notices():
                 return _carried_out(arguments, as_json)
         except KeyboardInterrupt as error:
-            what = f"the command was interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
+            what = f"the command was interrupted ({str(error) or 'SIGINT'}); incomplete results were discarded"
             number = getattr(error, "signal_number", None)  # of an `InterruptedBySignal`
             code = _EXIT_INTERRUPTED if number is None else 128 + int(number)
             print(what, file=sys.stderr)

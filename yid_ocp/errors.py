@@ -123,8 +123,7 @@ def unknown_name_error_arguments(name: str, known: Iterable[str], otherwise: str
     The hint asks whether the most similar known name was meant. If no name is similar, it is `otherwise`.
     """
     names = [str(entry) for entry in known]
-    example = next(iter(_close(name, names, 1, 0.0)), "")
-    otherwise = otherwise or (f"use an allowed name, such as '{example}'" if names else f"leave '{name}' out")
+    otherwise = otherwise or ("use one of the allowed names" if names else f"leave '{name}' out")
     return {"allowed": _listed(name, names) or "none", "hint": nearest_name_question(name, names) or otherwise}
 
 

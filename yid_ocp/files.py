@@ -33,7 +33,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
     Every file that this package did not write or ship is checked, so pipes and devices are refused before reading.
     """
-    allowed = "the path of a readable file"
+    allowed = "the path of an existing, readable file"
     try:
         info, readable = path.stat(), os.access(path, os.R_OK)
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError

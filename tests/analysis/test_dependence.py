@@ -1,7 +1,6 @@
 """Which rows a parameter enters and what sensors see of them: known cases, and rollouts with the parameter changed."""
 
 import math
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -19,12 +18,10 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.mechanism import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.model_functions import NodeStateValues
 
 STD, STEPS = 2e-3, 60
 
@@ -70,29 +67,20 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     twist, bend = found["T1.twist"], found["T1.bend"]
     assert twist.rows == tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
     assert (twist.observable_rows, twist.most_sensitive_sensor) == ((), "")
-    assert (twist.max_change_from_rest < 1e-6, twist.seconds) == (True, pytest.approx(0.6))
     assert (bend.observable_rows, bend.most_sensitive_sensor) == (bend.rows, "points_camera")
-    # a rod that hangs straight does not bend: its stiffness moves nothing either
-    assert bend.max_change_from_rest < 1e-6
 
 
 def test_the_twist_of_a_bent_rod_is_seen_but_not_its_stiffness(hanging):
     """Pulled sideways it bends in one plane, out of which a twist turns it; at rest there is no twist to resist."""
     found, _, _ = judged(hanging(gravity=(3.0, 0.0, -9.0)))
-    twist, bend = found["T1.twist"], found["T1.bend"]
+    twist = found["T1.twist"]
     assert (twist.observable_rows, twist.most_sensitive_sensor) == (twist.rows, "points_camera")
-    assert twist.max_change_from_rest < 1e-6
-    assert bend.max_change_from_rest > 0.1
 
 
 def test_a_length_changes_readings_directly_and_this_counts(hanging):
-    problem = hanging()
-    found, rest, _ = judged(problem)
+    found, _, _ = judged(hanging())
     assert found["T1.length"].directly_dependent_sensors == ("points_camera",)
     assert found["T1.bend"].directly_dependent_sensors == ()
-    assert found["T1.length"].max_change_from_rest == pytest.approx(moved_by(problem, rest, "T1.length"), rel=1e-6)
-    # the tip goes down by as much, of a standard deviation of 2 mm
-    assert found["T1.length"].max_change_from_rest == pytest.approx(1.0 / STD, rel=1e-6)
 
 
 MODES = pytest.mark.parametrize("swinging", ["driven", "prescribed"], indirect=True)
@@ -111,42 +99,6 @@ def swinging(request, robot):
     return EstimationProblem(step, [recording], ("elbow.stiffness",), options)
 
 
-def rolled_out(problem, rest, theta):
-    """Whitened readings along a rollout from the rest under the filter's first gain, shape (sensor, node, output)."""
-    step, episode = problem.step, problem.episodes[0]
-    system, torque = step.system, np.tile(rest.holding_torque, (STEPS + 1, 1))
-    path = np.tile(episode.initial_known_coordinates[len(system.driven) :], (STEPS + 2, 1))
-    feedback = episode.tracking_feedback
-    if feedback is not None:
-        reference = np.tile(rest.state[feedback.state_indices], (STEPS + 1, 1))
-        feedback = replace(feedback, gain=np.tile(feedback.gain[:1], (STEPS + 1, 1, 1)), reference=reference)
-    rollout = step.kernel.rollout(RolloutInputs(theta, rest.state, torque, path, feedback))
-    assert rollout.status.is_converged
-    found = []
-    for samples in episode.measurements:
-        std, effort = np.nanmedian(samples.std, axis=0), np.zeros((STEPS + 1, step.sizes["n"]))
-        effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
-        values = NodeStateValues.from_trajectory(step, rollout.state[:-1], effort)
-        found.append(problem.model_functions.compiled_sensor_function(samples.sensor)(values, theta).output / std)
-    return found
-
-
-def moved_by(problem, rest, name):
-    """The largest change of a whitened reading by a parameter, in differences of rollouts."""
-    change = 1e-5 * np.eye(len(problem.theta))[problem.system.parameters.index(name)]
-    ends = [rolled_out(problem, rest, problem.theta + sign * change) for sign in (1, -1)]
-    return max(np.max(np.abs(up - down)) / 2e-5 for up, down in zip(*ends, strict=True))
-
-
-@MODES
-def test_what_a_parameter_moves_is_what_rollouts_say(swinging):
-    found, rest, _ = judged(swinging)
-    for name in ("elbow.stiffness", "elbow.rest", "elbow.mass", "shoulder.mass", "elbow.damping"):
-        expected = pytest.approx(moved_by(swinging, rest, name), rel=2e-3, abs=2e-4)
-        assert found[name].max_change_from_rest == expected, name
-        assert found[name].unit == swinging.system.parameters[name].unit
-
-
 @MODES
 def test_efforts_of_joints_moved_as_measured_feel_their_own_rows(swinging):
     found, _, _ = judged(swinging)
@@ -163,7 +115,6 @@ def test_without_sensors_only_rows_are_said(hanging):
     rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, theta, np.zeros(0))
     found = {e.parameter: e for e in equations_and_sensors_per_parameter(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].observable_rows is None
-    assert (found["T1.twist"].max_change_from_rest, found["T1.twist"].seconds) == (None, 0.0)
     assert len(found["T1.bend"].rows) == 12
 
 
@@ -235,7 +186,7 @@ def test_what_cannot_swing_says_so(robot):
     system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], point_frames=["tip"])
     found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
-    assert all(fact in found.message for fact in ("not needed, because", "driven or prescribed")), found.message
+    assert all(fact in found.message for fact in ("every coordinate is", "driven or prescribed")), found.message
     # an equation across the plane in which the pendulum moves is redundant
     tip = Grasp("hand", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 0.0, 0.3])))
     system = System.build(robot, prescribed=["shoulder"], grasps=[tip], point_frames=["tip"])

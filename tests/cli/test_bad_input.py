@@ -110,7 +110,7 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
     ("change", "words"),
     [
         (lambda j: setitem(j["effort"], (5, 1), np.nan), ("'effort' has 1 missing", "joint 'elbow' at t = 0.05 s")),
-        (lambda j: setitem(j["t"], 7, j["t"][5]), ("the clock does not advance", "index 6", "strictly increasing")),
+        (lambda j: setitem(j["t"], 7, j["t"][5]), ("the clock does not advance", "sample 7", "strictly increasing")),
         (lambda j: setitem(j["position"].attrs, "unit", "deg"), ("the unit is 'deg', but must be 'rad'", "convert")),
         (lambda j: setitem(j["position"], ..., np.rad2deg(j["position"][...]) + 90), ("degrees", "rad")),
         (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?")),

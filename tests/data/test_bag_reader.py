@@ -382,7 +382,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
             ],
             "1 of 2 messages lack 'effort'",
         ),
-        ([("/j", START + k, joint_state(("a",), START, position=[k])) for k in range(2)], "from index 0 to 1"),
+        ([("/j", START + k, joint_state(("a",), START, position=[k])) for k in range(2)], "from sample 1 to 2"),
         ([("/p", START + k, point(START, (k, 1, 1))) for k in range(2)], "point 'p' has two positions"),
     ],
     ids=["nothing", "no positions", "length", "sometimes", "repeated joints", "repeated point"],

@@ -124,8 +124,8 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
     "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "2 columns are called 'q_a'", ""),
     "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' have the same meaning, position a", ""),
-    "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
-    "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
+    "unknown column": ("t,q_a,label\n0,1,2\n", {}, "not known: label", "label=skip"),
+    "bare prefix": ("t,q_\n0,1\n", {}, "not known: q_", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
     "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no measurements", ""),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
@@ -145,8 +145,8 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "empty cell of a joint": ("t,q_a,q_b\n0,1,1\n1,1,\n", {}, "infinite value, the first of joint 'b' at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
     "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg, others in rad", ""),
-    "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "meaning of column 'q_a .mrad.'", ""),
-    "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "meaning of column 'force_x'", ""),
+    "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "not known: q_a .mrad.", ""),
+    "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "not known: force_x", ""),
     "unit of what": (GOOD, {"units": {"angle": "deg"}}, "'angle', which is not the name of a quantity", ""),
     "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
     "unit of a switch": (GOOD, {"units": {"torque_enable": "V"}}, "is not a unit of .torque_enable.", "leave"),
@@ -283,7 +283,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
     # a name that says nothing is not guessed
     path.write_text("t,j0\n0,1\n1,2\n", encoding="utf-8")
-    refused(path, "meaning of column 'j0' is not known")
+    refused(path, "meaning is not known: j0")
 
 
 @pytest.mark.parametrize(
@@ -413,4 +413,4 @@ def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_real_table_that_is_no_recording_is_refused(shared: Path) -> None:
-    refused(shared / "recordings" / "deft" / "bdlo1_undeformed.csv", "meaning of column 'point'")
+    refused(shared / "recordings" / "deft" / "bdlo1_undeformed.csv", "no column of times")

@@ -234,7 +234,7 @@ def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     quiet = replace(fit, held_out_loss=replace(lost, block_chi2=0 * lost.block_chi2, baseline_chi2=0.0))
     assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(finding, nominal_model=quiet), tmp_path))
     text = text_of(page_of(finding, tmp_path))
-    texts = "as far as it can be located, comes ", "would have been detected", "the effort sensor (rec"
+    texts = "The recordings attribute the error beyond noise to ", "would have been detected", "the effort sensor (rec"
     texts += "No two signatures are similar in both directions", "The most significant value is that of elbow"
     assert [part for part in texts if part not in text] == []
 

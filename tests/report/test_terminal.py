@@ -84,7 +84,7 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved())
     assert lines[0].startswith("p_at_bound ended at the lower bound"), "no value is safe"
     size, text = "chi2 per degree of freedom is 1.03; noise alone gives 1", " ".join(lines)
-    assert "These recordings do not determine p_not_identifiable. To find an experiment that" in text
+    assert "These recordings do not determine p_not_identifiable. `yid-ocp identifiability` shows why" in text
     assert "1 of 4 free parameters are found: their ± (one standard deviation) is at most 10 % of the value" in text
     assert "These parameters are only weakly determined: p_weak. Use their 95 % intervals, which are rough." in text
     assert f"The model explains the recordings to within their noise ({size})." in text
@@ -105,7 +105,7 @@ def test_a_solve_says_what_is_not_found():
     issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
     both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
     lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
-    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak). To" in " ".join(lines)) == (True, True)
+    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak). `yid-ocp" in " ".join(lines)) == (True, True)
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
     parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"
@@ -145,24 +145,19 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     ("error", "noise", "fit", "said"),
     [
         (0.012, 0.010, GOOD, None),
-        (0.012, 0.002, GOOD, "points shows a gap. Before you use any value, run `yid-ocp diagnose`. The rms error of"),
+        (0.012, 0.002, GOOD, "points shows a gap: its held-out rms error is 12 mm, and noise alone gives 2 mm. Before"),
         (0.003, 0.002, GOOD, None),
-        (
-            0.003,
-            0.002,
-            BAD,
-            "is 3 mm on held-out and 1.8 mm on fitted recordings. Noise alone gives 2 mm, the best guess without a mod",
-        ),
+        (0.012, 0.002, BAD, None),
     ],
 )
-def test_a_held_out_error_is_said_beside_the_fitted_one_the_guess_and_the_noise(error, noise, fit, said):
+def test_a_held_out_error_far_above_noise_is_said_first(error, noise, fit, said):
     own = "points.p"
     entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
     known["parameters"] = {"a": parameter("identifiable")}
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:15]))
     assert ("You can use these values" in text) == (fit is GOOD and error < 6 * noise)
-    assert ("1.8 mm" in text.partition("parameter  ")[0], (said or "") in text) == (bool(said), True)
+    assert ("shows a gap" in text, (said or "") in text) == (bool(said), True)
 
 
 def test_an_interval_is_shown_of_every_number_that_is_known():
@@ -222,7 +217,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
     assert "No set of up to three changes makes it possible to find all parameters." in lines
-    assert "0 of 1 parameters can be found" in lines[0]
+    assert "0 of 1 parameters can be determined" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     lines = told("yid-identifiability/1", result)
     assert any("fewest changes that determine all: a weld." in line for line in lines)

@@ -65,7 +65,7 @@ def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) 
     built = system.map_expressions(lambda x: ca.SX(ca.densify(ca.Function("number", [symbols], [x])(values))))
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
-    return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
+    return _compared("this model", built.mechanism, gravity, inert, heavy, posture)
 
 
 def compare_urdf_with_pinocchio(
@@ -95,7 +95,7 @@ def compare_urdf_with_pinocchio(
         model = pin.buildReducedModel(model, [i for i in range(1, model.njoints) if model.names[i] not in joints], at)
     model.gravity.linear = gravity
     posture = np.zeros(len(mechanism.joints))
-    return _compared(f"{path.name} as read", mechanism.with_numeric_values(), gravity, model, model, posture)
+    return _compared(f"the file {path.name}", mechanism.with_numeric_values(), gravity, model, model, posture)
 
 
 def _without(path: Path, links: Sequence[str]) -> str:

@@ -62,9 +62,7 @@ class EquationsAndSensorsOfParameter:
     observable_rows: tuple[str, ...] | None  # those of `rows` that change a reading to first order; None: no sensors
     most_sensitive_sensor: str  # with the largest response to the rows; empty if no sensor responds
     directly_dependent_sensors: tuple[str, ...]  # sensors whose readings contain the parameter
-    max_change_from_rest: float | None  # largest change of a reading per unit of the parameter [standard deviations]
-    seconds: float  # length of the simulated response [s]
-    change_along_recordings: float | None = None  # root of the sum of squared changes of all readings, likewise
+    change_along_recordings: float | None = None  # root of the sum of squared changes of all readings, per unit [stds]
 
 
 def equations_and_sensors_per_parameter(
@@ -89,23 +87,20 @@ def equations_and_sensors_per_parameter(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(EquationsAndSensorsOfParameter(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(EquationsAndSensorsOfParameter(*entry, None, "", ()) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
     sensors = _sensors(step, episode, state, theta)
     steps = min(_RESPONSE_STEPS, episode.grid.steps)
-    pushed = np.vstack([stages.residual_by_theta[0], stages.p1_by_theta[0]])
-    by_row = _answers(step, stages, gain, np.eye(len(names)), sensors, steps, False)
-    by_theta = _answers(step, stages, gain, pushed, sensors, steps, True)
-    strength, span = np.max(by_row, axis=0, initial=0.0), steps * step.time_step
+    by_row = _answers(step, stages, gain, np.eye(len(names)), sensors, steps)
+    strength = np.max(by_row, axis=0, initial=0.0)
     found = []
     for i, entry in enumerate(known):
         answered = [r for r in sorted(entered[i]) if strength[r] > _MIN_RELATIVE_RESPONSE * np.max(strength)]
-        best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
-        moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(EquationsAndSensorsOfParameter(*entry, seen, best, read, moved, span))
+        best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else "".join(read[:1])
+        found.append(EquationsAndSensorsOfParameter(*entry, seen, best, read))
     return tuple(found)
 
 
@@ -140,9 +135,8 @@ def _answers(
     push: Array,
     sensors: Sequence[_WhitenedSensor],
     steps: int,
-    held: bool,
 ) -> Array:
-    """Return each sensor's largest whitened response (sensors, c) to c inputs `push` in one step or, if `held`, all."""
+    """Return each sensor's largest whitened response (sensors, c) to c inputs `push` in one step."""
     sizes, h = step.sizes, step.time_step
     n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
     nt = n + nz + sizes["m"]
@@ -156,12 +150,12 @@ def _answers(
     old, p_old = old - stages.residual_by_input[0] @ gain, p_old - stages.p1_by_input[0] @ gain
     x, largest = np.zeros((sizes["nx"], width)), np.zeros((len(sensors), width))
     for k in range(steps + 1):
-        added = push if held or k == 0 else np.zeros_like(push)
+        added = push if k == 0 else np.zeros_like(push)
         y, effort = np.zeros((nt, width)), np.zeros((n, width))
         y[solved] = -inverse @ (old @ x + added[:nt])[solved]
         effort[known] = -(new @ y + old @ x + added[:nt])[known] / h
         for i, sensor in enumerate(sensors):
-            read = sensor.by_state @ x + sensor.by_effort @ effort + (sensor.by_theta if held else 0.0)
+            read = sensor.by_state @ x + sensor.by_effort @ effort
             largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
         x = np.vstack([y[:n], p_new @ y + p_old @ x + added[nt:], y[n : n + nz]])
     return largest
@@ -324,7 +318,7 @@ def step_map_natural_frequencies(
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         return UndampedStepMapFrequencies(
-            np.zeros(0), message="not needed, because every coordinate is driven or prescribed"
+            np.zeros(0), message="every coordinate is driven or prescribed, so none vibrates"
         )
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
@@ -334,7 +328,7 @@ def step_map_natural_frequencies(
     damps = [name.rpartition(".")[2] in _DAMPING_PARAMETERS for name in system.parameters.names]
     without, values = (_eigenvalues(step, rest, known, own) for own in (np.where(damps, 0.0, theta), theta))
     if without is None or values is None:
-        said = "not computed, because a step's equations are singular. Look for redundant grasps or massless links"
+        said = "a step's equations are singular. Look for redundant grasps or massless links"
         return UndampedStepMapFrequencies(np.zeros(0), message=said)
     angles = np.sort(np.angle(without))
     turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]

@@ -34,11 +34,11 @@ SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # of an alias in entries, because merging one compares its mapping with all others
-_ALLOWED_YAML = "keys whose values are numbers, text, true or false, [lists] or sections"
+_ALLOWED_YAML = "lines KEY: VALUE, those of a section with the same indentation; numbers, text, true, false or [lists]"
 _FACTORS = {("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("min", "s"): 60.0, ("mm", "m"): 1e-3, ("cm", "m"): 1e-2}
 _FACTORS |= {("deg", "rad"): math.pi / 180, ("g", "kg"): 1e-3, ("kHz", "Hz"): 1e3, ("mN m", "N m"): 1e-3}
 _YAML_FAULTS = {  # what the parser says: in plain words, and the cure
-    "expected <block end>": ("its indentation differs from that of the lines above", "align the keys of each section"),
+    "expected <block end>": ("its indentation differs from that of the lines above", "indent it like its section"),
     "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
     "cannot start any token": ("a tab, or a character that needs quotes", "indent by spaces, and quote such text"),
     "could not find expected ':'": ("a key without a colon", "write KEY: VALUE, with a space after the colon"),
@@ -79,12 +79,12 @@ def _read(path: Path) -> str:
     try:
         return read_input_text(path, _MAX_BYTES)
     except DataError as error:
-        what, hint = error.what, error.hint
+        what, allowed, hint = error.what, "a YAML file in UTF-8 of at most 1 MiB", error.hint
         if isinstance(error.__cause__, FileNotFoundError):
-            what = "there is no such configuration file"
+            what, allowed = "there is no such configuration file", "the path of an existing YAML file"
             init = "correct the path, or write a configuration: yid-ocp init ROBOT RECORDING --out CONFIG.yaml"
             hint = nearest_file_question(path, "*.y*ml") or init
-        raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
+        raise ConfigError(what, where=str(path), allowed=allowed, hint=hint) from error
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]:

@@ -103,7 +103,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
         late = _late_points(first, other, other.name, 0.0)
         if late:
             return 0.0, f"{said}, so nothing was shifted. But {late}"
-        return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS"
+        return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS (added)"
     best = _motion_lag(first, other, begin - start)
     if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"

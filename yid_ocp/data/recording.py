@@ -450,7 +450,12 @@ def _validate_points(group: PointGroup, where: str) -> None:
         what = f"the position of point '{group.names[column]}' is {position} m at t = {group.t[row]:g} s"
         allowed, hint = "three finite coordinates, or three NaN", "write three NaN where the point was not seen"
         raise DataError(what, where=f"{where}/position", allowed=allowed, hint=hint)
-    _check_distances(group.position[~unseen], f"{where}/position", ", or import the data again with --units points=mm")
+    largest, allowed = float(np.abs(group.position[~unseen]).max(initial=0.0)), f"up to {_LARGEST_DISTANCE:g} m"
+    what, hint = (
+        f"a coordinate reaches {largest:g} m",
+        "if the unit is millimetres, import again with --units points=mm",
+    )
+    raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, f"{where}/position", allowed, hint)
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]
@@ -464,11 +469,13 @@ def _validate_points(group: PointGroup, where: str) -> None:
         _validate_std(group.clock_offset_std, 0, "clock_offset_std", f"{where}, attribute", "one number [s]")
 
 
-def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
-    largest = float(np.abs(positions).max(initial=0.0))
-    hint = "if the unit is millimetres, convert the values to metres"
-    what, allowed = f"a coordinate reaches {largest:g} m, beyond {_LARGEST_DISTANCE:g} m", "coordinates in metres"
-    raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
+def _check_distances(positions: Array, where: str) -> None:
+    largest, allowed = float(np.abs(positions).max(initial=0.0)), f"coordinates up to {_LARGEST_DISTANCE:g} m"
+    what, hint = (
+        f"a coordinate reaches {largest:g} m",
+        "if the unit is millimetres, import again with --units points=mm",
+    )
+    raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint)
 
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
@@ -548,7 +555,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
     if (backward := np.flatnonzero(np.diff(group.t) <= 0)).size:
         index = int(backward[0])
         before, after = float(group.t[index]), float(group.t[index + 1])
-        what = f"the clock does not advance from index {index} to {index + 1}: {before!r} s, then {after!r} s"
+        what = f"the clock does not advance from sample {index + 1} to {index + 2}: {before!r} s, then {after!r} s"
         allowed, hint = "strictly increasing times", "remove the repeated sample"
         if after < before:
             hint = "if the clock was set back, cut the file here into two recordings; if rows are mixed, sort by time"

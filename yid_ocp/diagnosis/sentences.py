@@ -23,7 +23,7 @@ _MAX_NAMED = 5  # number of named parameters, the largest changes first, and of 
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
-    "plant": "the mechanics, not a sensor",
+    "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
     "sensor": "a sensor, not the mechanics",
     "either": "the mechanics or the effort sensor (recorded efforts alone do not show which)",
     "both": "both the mechanics and a sensor",
@@ -158,7 +158,7 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
-    return f"The error beyond noise, as far as it can be located, comes from {', '.join(named)}.{''.join(side)}"
+    return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
@@ -225,11 +225,11 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = f"no tried effect both has a size above {limits.min_z:g} times its ± and explains the error well enough"
+    tried = f"every tried effect has a size below {limits.min_z:g} times its ± or explains too little of the error"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
-    more = f"Leave out diagnosis.candidates, if it is set, to try more than {', '.join(kinds)}."
+    more = f"Only {', '.join(kinds)} was tried. To try all effects, set diagnosis.candidates: all."
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
     none = _said((result.single_effect_models, tried), (result.untried, stopped), (True, tried))[0]
     few += "".join(_said((math.isfinite(closed), end)))
@@ -259,15 +259,14 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
 
 def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
     """Line with an effect's estimates, and warnings if one is far outside its range or no size is determined."""
-    values = []
-    for name, r in effect.to_reported_parameters(fit.values, fit.std).items():
-        known = f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}".removesuffix(" 1")
-        values.append(f"{name} = {_said((math.isfinite(r.std), known), (True, 'unknown'))[0]}")
-    ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:]]
-    far, so = " (far outside its expected range", "so possibly a substitute for another cause)"
-    odd = [f"{far}, {low:.3g} to {high:.3g}, {so}" for low, high in ranges]
-    unsure = _said((not fit.determines_size(effect, limits.min_z), " (these recordings do not determine its size)"))
-    return "".join([f"  {effect.label}: {', '.join(values)}", *odd, *unsure])
+    known = [*effect.to_reported_parameters(fit.values, fit.std).items()]
+    texts = {name: f"{value_and_uncertainty_text(r.value, r.std, least_digits=3)} {r.unit}" for name, r in known}
+    values = [f"{name} = {texts[name].removesuffix(' 1')}" for name, r in known if math.isfinite(r.std)]
+    ranges = [effect.prior_ranges[name] for name in fit.implausible_parameters(effect, limits)[-1:] if values]
+    far, so = "far outside the expected range of", "so possibly a substitute for another cause"
+    odd = [f"{far} {low:.3g} to {high:.3g}, {so}" for low, high in ranges]
+    unsure = _said((not fit.determines_size(effect, limits.min_z), "these recordings do not determine its size"))
+    return f"  {effect.label}: {'; '.join([*filter(None, [', '.join(values)]), *odd, *unsure])}"
 
 
 def _remains(result: DiagnosisResult) -> list[str]:

@@ -263,8 +263,8 @@ def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
     for axis, size in zip("xy", segment.cross_section_size or (), strict=False):
         rows.append((f"size_{axis}", size, "m", small, f"extent of the section along {axis}"))
     rows += [
-        ("bend", segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
-        ("twist", segment.twist, per, 0.0, "twisting stiffness of every joint, about z"),
+        ("bend", segment.bend, per, 0.0, "bending stiffness of each joint, about x and y"),
+        ("twist", segment.twist, per, 0.0, "twisting stiffness of each joint, about z"),
         ("damping", segment.damping, rate, 0.0, "viscous damping of every coordinate"),
     ]
     if segment.twist_damping is not None:

@@ -71,7 +71,8 @@ def _example_robot_urdf(robot: str) -> Path:
         allowed = ", ".join(f"package:{n}" for n in found)
         raise ModelError(what, where=where, allowed=allowed, hint=f"choose one of them, such as package:{found[0]}")
     what, stems = f"example-robot-data has no robot '{robot}'", sorted({*short, *(p.stem for p in files.values())})
-    said = unknown_name_error_arguments(robot, stems, f"choose one of the robots, such as package:{stems[0]}")
+    hint = f"set the path of your robot's URDF or MJCF file, or choose one of the robots below {folder}"
+    said = unknown_name_error_arguments(robot, stems, hint)
     raise ModelError(what, where=where, **said)
 
 

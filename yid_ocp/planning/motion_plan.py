@@ -87,7 +87,7 @@ def plan_motion_to_target(
     start = solve_start_equilibrium(step, values, _posture(system, options, values))
     path = RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
     mover = PathSimulator(step, values, start, path, options.hold_duration)
-    point, inside = _points(system, options)
+    point, inside = moved_point_and_boxed_frames(system, options)
     place = _place(options, mover.frame_positions_along_states(point, start.state[None])[0, 0])
     if inside is not None:
         _check_box(options, inside, mover.frame_positions_along_states(inside, start.state[None])[0], place)
@@ -128,7 +128,10 @@ def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
-def _points(system: System, options: PlanOptions) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
+def moved_point_and_boxed_frames(
+    system: System, options: PlanOptions
+) -> tuple[FramePositionEvaluator, FramePositionEvaluator | None]:
+    """Return evaluators of the moved point and of the frames in a box. Raises `ConfigError` for unknown frames."""
     if options.point is None:
         what, hint = "plan.point is missing, the point that moves to the target", "add --set plan.point=NAME"
         allowed = ", ".join(system.point_frames or system.mechanism.frames)

@@ -43,10 +43,10 @@ from yid_ocp.report.terminal import (
 )
 
 _BASELINE_DESCRIPTIONS = {
-    "stays": "readings do not change",
-    "zero": "efforts are zero",
+    "stays": "constant readings",
+    "zero": "no efforts",
     "moves_with_clamps": "points move like the mean of the clamps",
-    "linear_carry": "points are interpolated between the clamps",
+    "linear_carry": "points on lines between the clamps",
 }
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
@@ -65,16 +65,17 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
-        predicted, notes = [*_prediction_sentences(result)], result.get("discretisation_notes", ())
+        fit, notes = result["fit"], result.get("discretisation_notes", ())
         yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
         notes = (*notes, *_bound_sentences(free))
-        is_safe = result["fit"]["explains"] and not notes and not any(" shows a gap. " in text for text in predicted)
-        fit, causes = result["fit"], grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
+        gaps = [*_gap_sentences(result)] if fit["explains"] else []
+        is_safe = fit["explains"] and not notes and not gaps
+        causes = grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
         said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
         if said and "noise_overstated" in causes:
             said = "The stated noise is too large to test whether the model explains the recordings."
         still = " ".join(causes.get("weak_excitation", ()))
-        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *predicted)
+        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *gaps)
         texts = (*found, *doubts) if is_safe else (*doubts, *found)
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
@@ -91,7 +92,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("parameter", *heads, "meaning")]
     for name, entry in free.items():
         verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
-        std = "no limit" * (verdict == "weak") if entry["std"] is None else f"{entry['std']:.2g}"
+        std = "infinite" * (verdict == "weak") if entry["std"] is None else f"{entry['std']:.2g}"
         std *= verdict not in ("", "at_bound") and entry["value"] not in (entry["lower"], entry["upper"])
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         own = ("–" if verdict == "not_identifiable" else value, std, interval, shown_unit(entry["unit"]))
@@ -111,7 +112,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
-    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s)."
+    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -127,7 +128,7 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     elif len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
     if lost:
-        steps["rank experiments that determine the missing parameters"] = "identifiability --what-if"
+        steps["rank experiments that determine the missing parameters (takes minutes)"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
     return steps
@@ -148,33 +149,20 @@ def _interval_cell(entry: Mapping[str, Any], std: float | None) -> str:
     return interval_text(low if lower is None else max(low, lower), high if upper is None else min(high, upper))
 
 
-def _prediction_sentences(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences that compare the held-out error of a group of channels with noise.
-
-    A group gets one if the model does not explain the fitted data, or its error is over twice that of noise.
-    """
+def _gap_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a sentence for each group of channels whose held-out error is over twice that of noise."""
     residuals = result["residuals"]
+    advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
     for group, channels in grouped((channel.rpartition(".")[0], channel) for channel in residuals).items():
-        unit, fitted = residuals[channels[0]]["unit"], _rms([residuals[c]["rmse"] for c in channels])
         entries = [entry for entry in result["held_out"] if set(channels) <= set(entry["rmse"])]
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
-        if noise is None or error is None or fitted is None:
-            continue
-        known = [entry["baselines"] for entry in entries]
-        names = [n for n in known[0] if all(set(channels) <= set(own.get(n, {})) for own in known)]
-        best = min((_rms([own[n][c] for own in known for c in channels]) or 0.0 for n in names), default=None)
-        sizes = error, fitted, noise, best
-        held, own, alone, guess = (" ".join(value_text_and_display_unit(x, unit)).rstrip() for x in sizes)
-        text = (
-            f"The rms error of {group} is {held} on held-out and {own} on fitted recordings. Noise alone gives {alone}"
-        )
-        text += f", the best guess without a model {guess}." if guess else "."
-        advice = "run `yid-ocp diagnose`" if result["fit"]["data_trusted"] else "follow the advice on the issues"
-        if not result["fit"]["explains"]:
-            yield text
-        elif error > MAX_NOISE_RATIO * noise:
-            yield f"{group} shows a gap. Before you use any value, {advice}. {text}"
+        if error and noise and error > MAX_NOISE_RATIO * noise:
+            held, alone = (
+                " ".join(value_text_and_display_unit(x, residuals[channels[0]]["unit"])) for x in (error, noise)
+            )
+            text = f"{group} shows a gap: its held-out rms error is {held}, and noise alone gives {alone}."
+            yield f"{text} Before you use any value, {advice}."
 
 
 def _rms(values: Sequence[float]) -> float | None:
@@ -185,7 +173,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     named = list(dict.fromkeys(name for entry in result["held_out"] for name, own in entry["baselines"].items() if own))
-    guesses = (f"guess: {_BASELINE_DESCRIPTIONS.get(name, name)}" for name in named)
+    guesses = (f"without model: {_BASELINE_DESCRIPTIONS.get(name, name)}" for name in named)
     rows: TableRows = [("recording", "channel", "model", "noise alone", *guesses, "unit")]
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
@@ -197,11 +185,12 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors (rms) on held-out recordings, which the fit does not use")
-    said = "A model error up to twice that of noise alone is normal."
-    said += " Noise alone includes errors of the torques, which carry the arm away." * bool(
-        result.get("torque_offsets")
-    )
-    yield said if any(row[3] for row in rows[1:]) else ""
+    known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
+    is_large = any(error > MAX_NOISE_RATIO * noise for error, noise in known if error and noise)
+    said = "An error above twice that of noise alone shows an error of the model."
+    said = said if is_large else "No error exceeds twice that of noise alone, so the model predicts them well."
+    said += " Noise alone includes the effect of torque errors." * bool(result.get("torque_offsets"))
+    yield said if known else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -229,7 +218,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
     if lost:
         none = "Use no value. " * (len(lost) == len(free))
         causes = [name + " (motion too weak)" * (f"parameters.{name}.free" in still) for name in lost]
-        do = "To find an experiment that does, run `yid-ocp identifiability --what-if`."
+        do = "`yid-ocp identifiability` shows why, and with --what-if it ranks experiments that do."
         yield f"{none}These recordings do not determine {abbreviated_names_text(causes)}. {do}"
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
@@ -267,7 +256,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", "95 % interval", "verdict")]
     for name, entry in parameters.items():
         std = entry["std_relative"]
-        spread, absolute = "no limit", None
+        spread, absolute = "infinite", None
         if std is not None:
             spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", std * abs(entry["value"])
         interval = _interval_cell(entry, None if is_initial else absolute)
@@ -276,7 +265,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
     verb = "are expected to be" if is_initial else "can be"
-    said = f"{len(found)} of {len(parameters)} parameters {verb} found from these recordings (± of at most 10 %)"
+    said = f"{len(found)} of {len(parameters)} parameters {verb} determined by these recordings to within 10 %"
     said += f": {abbreviated_names_text(found)}" * bool(found)
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
@@ -287,8 +276,6 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
         yield SummaryStatement(told, "verdict")
     yield from issue_summary_blocks(result)
-    yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
-    is_poor = result["fit"] is not None and not result["fit"]["explains"]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
@@ -298,6 +285,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     for cause, own in grouped((cause or change, change) for change, _, cause in parts).items():
         said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
         yield said if own != [cause] else f"{cause}."
+    yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
+    is_poor = result["fit"] is not None and not result["fit"]["explains"]
     weak_changes = [*_weak_combined_changes(result["directions"])]
     said = "Some parameters can replace each other: the recordings hardly change if all parameters of a line change "
     said += "together, as stated in % of their values. Measure the first one in another way and fix it."
@@ -325,7 +314,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
-    steps = {"fit, for estimates with intervals": "identifiability"} if is_initial else {}
+    steps = {"fit, for estimates with intervals": "identifiability"} if is_initial and (found or weak) else {}
     steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
     more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
     steps |= {} if is_initial or result["profiles"] else more
@@ -449,7 +438,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    yield f"Pinocchio confirms the mass matrix, weight and inverse dynamics of {agreed}." if agreed else ""
+    yield (
+        f"The library Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
+    )
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
     noise = dict[Sequence[str], list[str]]()  # names of the recordings by noise of a channel
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
@@ -467,21 +458,19 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows += [(*cells, ", ".join(own) * (len(own) < len(result["recordings"]))) for cells, own in noise.items()]
     yield SummaryTable(rows, "Noise of the readings")
     share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
-    said = (
-        f"A fit uses {1 / share:.3g} times this std, because errors of the model are larger than the noise. This is a "
-    )
-    yield f"{said}setting, not a fault: diagnosis.noise_fraction_of_stated_std." if share < 1 else ""
+    said = f"A fit takes {1 / share:.3g} times this noise as the std of readings, to allow for errors of the model."
+    yield f"{said} This is set by diagnosis.noise_fraction_of_stated_std and no fault." if share < 1 else ""
     told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
     yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
-    for key, head in (("links", "links"), ("time_step", "time step [s]")):
+    for key, head in (("links", "number of links"), ("time_step", "time step [s]")):
         count = max((len(row["hertz"]) for row in convergence[key]), default=0)
         rows = [(head, *(f"mode {i + 1}" for i in range(count)), "remark")]
         for row in convergence[key]:
             hertz = [f"{f:.4g}" for f in row["hertz"]]
             rows.append((f"{row['value']:g}", *hertz, *[""] * (count - len(hertz)), row["message"]))
-        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] by {head}")
-    yield f"Natural frequencies were {convergence['message']}." if convergence["message"] else ""
+        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}")
+    yield convergence["message"]
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
     yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
@@ -514,7 +503,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     text += "can be told apart."
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
-        text += "noise hides a change of 10 %. `yid-ocp identifiability` tests this after a fit."
+        text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
     yield SummaryStatement(text if changes else "", "conclusion")
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
@@ -525,7 +514,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
     yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
-    yield SummaryTable(equations, "Equations that contain the parameter", is_page_only=not result["asked"])
+    title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
+    yield SummaryTable(equations, title, is_page_only=not result["asked"])
     rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
     for name in result["asked"] or result["parameters"]:
         entry = result["parameters"][name]
@@ -545,26 +535,29 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     """Return how a change of each named (else each free) parameter changes the readings, and the equations with it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
-    moved: TableRows = [("parameter", "change", "effect on all readings / noise", "visible", "most sensitive sensor")]
-    equations: TableRows = [("parameter", "equations", "observed by sensors", "change of one reading / noise")]
+    visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
+    moved: TableRows = [("parameter", "change", "effect on all readings / noise", visible, "most sensitive sensor")]
+    equations: TableRows = [("parameter", "equations", "observed by sensors")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
         observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
         sight = "" if seen is None or not rows else observed
-        moves, small = [own[key] and own[key] * change for key in ("along", "moved")], f"< {_NEGLIGIBLE_STDS:g}"
-        along, one = ("" if x is None else f"{x:.3g}" if x > _NEGLIGIBLE_STDS else small for x in moves)
-        is_visible = ""
-        if moves[0] is not None:
-            is_visible = "yes" if moves[0] >= _MIN_VISIBLE_CHANGE else "no"
-        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, own["best"]))
-        equations.append((name, _row_names_text(rows), sight, one))
+        along = is_visible = ""
+        if own["along"] is not None:
+            size = own["along"] * change
+            along = f"{size:.3g}" if size > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
+            is_visible = "yes" if size >= _MIN_VISIBLE_CHANGE else "no"
+        best = own["best"] or "–" * (seen is not None)
+        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, best))
+        equations.append((name, _row_names_text(rows), sight))
     return moved, equations
 
 
 def _shown_change(parameter: Mapping[str, Any]) -> float:
-    """Return the change of a parameter for which `inspect` shows the change of readings: 10 %, or one unit if zero."""
-    return abs(parameter["value"]) / 10 or 1.0
+    """Return the change for which `inspect` shows the change of readings: 10 % of value or largest bound, or 1 unit."""
+    limit = max(abs(parameter[key] or 0.0) for key in ("lower", "upper"))
+    return abs(parameter["value"]) / 10 or limit / 10 or 1.0
 
 
 def _row_names_text(names: Sequence[str]) -> str:

@@ -248,9 +248,9 @@ def torque_offset_table(result: Mapping[str, Any]) -> SummaryTable:
 
 
 def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
-    """Format the range between the bounds of a parameter, such as "0 to 5", "from 0", "up to 5" or "none"."""
+    """Format the range between the bounds of a parameter, such as "0 to 5", "≥ 0", "≤ 5" or "none"."""
     lower, upper = ("" if entry[key] is None else f"{entry[key]:.{digits}g}" for key in ("lower", "upper"))
-    one_sided = f"from {lower}" if lower else f"up to {upper}" if upper else "none"
+    one_sided = f"≥ {lower}" if lower else f"≤ {upper}" if upper else "none"
     return f"{lower} to {upper}" if lower and upper else one_sided
 
 

@@ -195,7 +195,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
-        return found | {"message": "not computed, because they depend on the posture, which a recording gives"}
+        return found | {"message": "Natural frequencies need a recording, which gives the posture."}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:
@@ -206,7 +206,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     frequencies = step_diagnostics.step_map_natural_frequencies
     own = frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
-        return found | {"message": own.message}
+        return found | {"message": f"No natural frequencies were computed: {own.message}."}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force_at: midpoint, " if rule[1] == "node" and system.grasps else ""
         grow = f"at the first posture, {count_with_noun(own.n_unstable_modes, 'vibration')} of the model would grow in "
@@ -215,8 +215,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     warnings += _too_stiff_start_warnings(system, theta, h, *(row["hertz"][:1] for row in (steps[0], steps[-1])))
-    step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g}"
-    _warn(found["warnings"], f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
+    step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g} (extrapolated)"
+    _warn(found, f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
         other = build_system(run, link_division=2)
@@ -225,7 +225,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
-        _warn(found["warnings"], links, item.divided_links_setting_text, rows)
+        _warn(found, links, item.divided_links_setting_text, rows)
     return found
 
 
@@ -252,12 +252,15 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 
 
-def _warn(warnings: list[str], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
-    """Warn of frequencies that differ between the first row and the last, finest row."""
+def _warn(found: dict[str, Any], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
+    """Warn of frequencies that differ between the first row and the last, finest row, or say that none does."""
     moved = [
         f"number {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
         for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False), start=1)
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
     ]
-    said = f"natural frequencies change by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}: {', '.join(moved)}"
-    warnings += [f"{said}. If your motions excite these vibrations, set {remedy}"] if moved else []
+    change = f"by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}"
+    said = f"natural frequencies change {change}: {', '.join(moved)}. Only if your motions excite these vibrations, set"
+    found["warnings"] += [f"{said} {remedy}"] if moved else []
+    fine = f"No natural frequency changes {change}, so this is fine enough. "
+    found["message"] += fine * (not moved and bool(rows[-1]["hertz"]))

@@ -163,7 +163,7 @@ class _RemainingTime:
         self._first_cost = entry.cost if self.n_iterates == 1 else self._first_cost
         cost = f"cost {entry.cost:.6g}" + f" (first {self._first_cost:.6g})" * (self.n_iterates > 1)
         seconds = f"{time.monotonic() - self._start_of_command:.1f} s"  # several searches follow each other
-        return ", ".join(filter(None, (f"iteration {entry.iteration}", cost, seconds, entry.note)))
+        return ", ".join(filter(None, (f"iteration {self.n_iterates - 1}", cost, seconds, entry.note)))
 
     def of_parts(self, done: int, total: int) -> str:
         """Return the text of a stage's remaining time, from its done parts. Empty if the command's time is known."""
@@ -181,15 +181,15 @@ def _format_duration(seconds: float) -> str:
 
 
 class StderrLogLinesProgress(Progress):
-    """A progress display that prints lines on standard error for stages, iterates, tenths of a stage and long waits."""
+    """A progress display that prints lines on standard error for stages, iterates, parts of a stage and long waits."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
-        self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)
+        self._lines, self._last, self._left = 0, 0.0, _RemainingTime(import_time)
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Print a line with the name of the stage and the remaining time."""
         interruption.raise_if_interrupted()
-        self._tenths, self._last = 0, time.monotonic()
+        self._lines, self._last = 0, time.monotonic()
         self._left.begin_stage(work, ahead)
         print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)
 
@@ -201,10 +201,10 @@ class StderrLogLinesProgress(Progress):
             print(f"  {told}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Print a line for every tenth of the stage, or if the last line is some seconds old."""
-        tenths, left = 10 * done // max(total, 1), self._left.of_parts(done, total)
-        if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
-            self._tenths, self._last = tenths, time.monotonic()
+        """Print up to twenty lines for the stage's parts, and others if the last line is some seconds old."""
+        lines, left = 20 * done // max(total, 1), self._left.of_parts(done, total)
+        if lines > self._lines or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
+            self._lines, self._last = lines, time.monotonic()
             print(f"  {done} of {total}, {text}{left or self._left.of_command()}", file=sys.stderr, flush=True)
 
 

@@ -60,8 +60,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         write_recording(recording, arguments.out)
     out, issues = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
-    first = "after the advice above is followed" if issues else "next"
-    then = f"{first}: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
+    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
+    then = f"{out} has the values as read: do not use it before the advice above is followed" if issues else then
     lines = [*recording_summary_lines(recording), *issues, "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
@@ -157,7 +157,9 @@ def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) ->
             matched, present = matched | set(own["column_meanings"]), present.union(names)
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:
-        said = unknown_name_error_arguments(min(missing), sorted(present), "correct the name, or leave it out")
+        said = unknown_name_error_arguments(
+            min(missing), sorted(present), "write COLUMN=MEANING with a column of a file"
+        )
         raise DataError(f"no file has a column '{min(missing)}'", where="--columns", **said)
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):
@@ -174,7 +176,8 @@ def _option_names_by_file(files: Sequence[str], options: Mapping[str, Any]) -> M
         if not any(name in own for own in known.values()):
             what = f"{_flag(name)} does not apply to {'this file' if len(files) == 1 else 'files of these formats'}"
             allowed = ", ".join(sorted(map(_flag, _KINDS.keys() & set().union(*known.values())))) or "no options"
-            raise DataError(what, where=_flag(name), allowed=allowed, hint=f"leave {_flag(name)} out")
+            others = ", or name all files of the recording, one with this offset" * (name == "file_clock_offsets")
+            raise DataError(what, where=_flag(name), allowed=allowed, hint=f"leave {_flag(name)} out{others}")
     return known
 
 

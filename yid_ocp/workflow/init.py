@@ -98,7 +98,7 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
                 raise ConfigError(what, where=f"--{name}", allowed=f"with --object {', '.join(templates)}", hint=hint)
         return None
     if (template := templates.get(word)) is None:
-        hint = "write --object cable for a rope, --object beam for a rod, or leave --object out"
+        hint = "write cable for a rope, beam for a rod (a configuration calls it `segments`), or leave --object out"
         said = unknown_name_error_arguments(word, templates, hint)
         raise ConfigError(f"there is no object '{word}'", where="--object", **said)
     links = template.default_links if arguments.links is None else arguments.links

@@ -34,7 +34,7 @@ _ENTRY_KEYS = "title row=row_name column=column_name zero=is_identically_zero li
 _INSPECTED_KEYS = ("value", "unit", "lower", "upper", "description")
 _DEPENDENCE_KEYS = (
     "parameter unit rows seen=observable_rows best=most_sensitive_sensor read=directly_dependent_sensors "
-    "moved=max_change_from_rest seconds along=change_along_recordings"
+    "along=change_along_recordings"
 )
 
 

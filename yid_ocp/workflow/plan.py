@@ -20,12 +20,17 @@ from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_
 from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan, plan_motion_to_target
+from yid_ocp.planning.motion_plan import (
+    ParameterCovarianceBeforePlan,
+    TargetMotionPlan,
+    moved_point_and_boxed_frames,
+    plan_motion_to_target,
+)
 from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
-from yid_ocp.workflow.build import build_step, cable_vertices_between_clamps, free_parameter_names
+from yid_ocp.workflow.build import build_step, build_system, cable_vertices_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -53,6 +58,8 @@ def run_plan(
         else:
             if run.model.arms.mode == "servo":  # prescribed arms have no parameters of servos
                 run = replace(run, parameters={k: own for k, own in run.parameters.items() if ".servo_" not in k})
+            with add_setting_location_to_errors(run, "plan"):
+                moved_point_and_boxed_frames(build_system(run), run.plan)  # reports a missing point before the compiler
             step = _compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))

@@ -292,10 +292,13 @@ def _read_table(
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
     numbers, bad = array("d"), dict[int, str]()
+    columns = options.column_meanings or {}
     if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
-    meanings, units = _meanings(names, options.column_meanings or {}, f"{path}, line {number}")
+    elif [*columns] == [str(i + 1) for i in range(len(columns))]:  # meanings in the order of the columns
+        columns = dict(zip([*names, *[*columns][len(names) :]], columns.values(), strict=False))
+    meanings, units = _meanings(names, columns, f"{path}, line {number}")
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
@@ -316,8 +319,8 @@ def _read_table(
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        said = f"left out {len(bad)} of {n_lines} lines, because they are not rows of numbers (line {listed})"
-        notes = (f"{said}. Of the first, {next(iter(bad.values()))}. The recording has no samples at their times",)
+        said = f"lines left out, because they are not rows of numbers: {len(bad)} of {n_lines} ({listed})"
+        notes = (f"{said}. In line {next(iter(bad))}, {next(iter(bad.values()))}. All other lines are used",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
@@ -396,14 +399,13 @@ def _meanings(
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
         if not found:
-            said = unknown_name_error_arguments(key, header)
-            if key.isdigit():  # the meanings are given in order
-                said["hint"] = f"name the columns, as in --columns '{header[0]}=t'; in order needs --no-header"
+            hint = "give COLUMN=MEANING for each column, or their meanings in order, such as t,position:JOINT,skip"
+            said = unknown_name_error_arguments(key, header, hint)
             raise DataError(f"there is no column '{key}'", where=where, **said)
         given |= {name: meaning.replace("*", own.group(1)) if "*" in key else meaning for name, own in found.items()}
     meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
     by_name, stated = column_meanings(header, _COMPONENTS)
-    units: dict[str, str] = {}
+    units, unknown = dict[str, str](), list[str]()
     for quantity, unit in stated:
         both = units.setdefault(quantity, unit), unit
         if len({base.factor_to_si_by_quantity({quantity: one}, where)[quantity] for one in both}) > 1:
@@ -412,14 +414,7 @@ def _meanings(
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given and name.lower() not in COUNTER_WORDS:
-            allowed = "a name such as t, q_<joint>, velocity_<joint>, effort_<joint>, position_command_<joint>, "
-            allowed += "<point>_x or <link>_force_x, then the unit if it is not SI, such as [deg]"
-            meaning = f"'{name}=position:JOINT'"
-            if "current" in name.lower():
-                meaning = f"'{name}=effort:JOINT' --units effort=A --torque-constants JOINT=N_M_PER_A"
-            hint = f"leave it out (--columns '{name}={base.SKIP_COLUMN_KEYWORD}'), or give its meaning, such as "
-            hint += f"--columns {meaning}"
-            raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
+            unknown.append(name)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
             hint = f"leave one out: --columns {name}={base.SKIP_COLUMN_KEYWORD}"
@@ -429,6 +424,14 @@ def _meanings(
         what = f"the table has no column of times; its columns are {', '.join(header)}"
         hint = "name the column of times, as in --columns 'COLUMN=t', or add times to the file"
         raise DataError(what, where=where, allowed="a column named t or time, in seconds", hint=hint)
+    if unknown:
+        what = f"columns whose meaning is not known: {', '.join(unknown)}"
+        skipped = ",".join(f"{name}={base.SKIP_COLUMN_KEYWORD}" for name in unknown)
+        meaning = f"'{unknown[-1]}=position:JOINT'"
+        if "current" in unknown[-1].lower():
+            meaning = f"'{unknown[-1]}=effort:JOINT' --units effort=A --torque-constants JOINT=N_M_PER_A"
+        hint = f"give a meaning, such as --columns {meaning}, or leave columns out: --columns '{skipped}'"
+        raise DataError(what, where=where, allowed=f"{_ALLOWED}, and a unit if it is not SI: q_elbow [deg]", hint=hint)
     return list(meanings.values()), units
 
 
