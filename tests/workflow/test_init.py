@@ -473,7 +473,7 @@ ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "nothing, no efforts and no commands": ((), "no measurement of the forces that move the arm", "--object"),
-    "no object by name": (("--object", "none"), "there is no object 'none'", "beam for a rod (a configuration calls it"),
+    "no object by name": (("--object", "none"), "there is no object 'none'", "beam for a rod (a configuration"),
     "a length of nothing": (ONE[:2], "--length needs --object", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
