@@ -51,7 +51,7 @@ def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith(
-        "the built model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio, except "
+        "this model: mass matrix, weight and inverse dynamics agree with those of the library Pinocchio, except "
     )
 
 
@@ -98,7 +98,7 @@ def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked)
     robot = read_urdf(file if package else path, joints=joints, locked=locked)
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, locked)
     assert found.agrees_within_rounding, found.words
-    assert found.words.startswith(f"{path.name} as read: ")
+    assert found.words.startswith(f"the file {path.name}: ")
 
 
 def test_a_file_read_wrongly_or_a_lock_at_another_value_is_said(urdf_folder):
@@ -109,7 +109,7 @@ def test_a_file_read_wrongly_or_a_lock_at_another_value_is_said(urdf_folder):
     wrong = replace(robot, joints=(*robot.joints[:-1], replace(joint, placement=placement)))
     found = compare_urdf_with_pinocchio(path, wrong, GRAVITY)
     assert not found.agrees_within_rounding
-    assert found.words.startswith("mixed_joints.urdf as read differs from Pinocchio's: ")
+    assert found.words.startswith("the file mixed_joints.urdf differs from Pinocchio's: ")
     robot = read_urdf(path, joints=KEPT, locked={"nod": 0.7})
     assert compare_urdf_with_pinocchio(path, robot, GRAVITY, KEPT, {"nod": 0.7}).agrees_within_rounding
     assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, KEPT, {"nod": 0.6}).agrees_within_rounding

@@ -71,7 +71,7 @@ def test_an_interruption_is_one_whatever_a_library_makes_of_it(cli, pendulum, le
     done = cli("solve", pendulum)
     signal.signal(signal.SIGINT, before)
     assert done.code == 130
-    assert done.err.rstrip().endswith("interrupted (SIGINT); nothing half-finished was left")
+    assert done.err.rstrip().endswith("interrupted (SIGINT); incomplete results were discarded")
     left_nothing()
 
 

@@ -40,7 +40,7 @@ def check_keys(result):
 def test_springs_that_cannot_be_told_apart(carried_out, repository):
     asked = ("--what-if", "--unknown-start", "--unknown-grasp")
     done = carried_out("identifiability", repository / "configs" / "springs_torsion.yaml", *asked)
-    assert ("0 of 2 parameters can be found" in done.out, "plan a motion" in done.out) == (True, False)
+    assert ("0 of 2 parameters can be determined" in done.out, "plan a motion" in done.out) == (True, False)
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, like springs in series" in " ".join(done.out.split())
     assert "fewest changes that determine all: coupling_marker, seen by the camera." in done.out
     result = done.result
@@ -56,7 +56,7 @@ def test_springs_that_cannot_be_told_apart(carried_out, repository):
 def test_springs_that_can(carried_out, repository):
     file = repository / "configs" / "springs_series_joint.yaml"
     done = carried_out("identifiability", file, "--intervals", "spring_1.stiffness", settings=NO_REPORT)
-    assert "2 of 2 parameters can be found" in done.out
+    assert "2 of 2 parameters can be determined" in done.out
     result, intervals = done.result, {name: own["interval"] for name, own in done.result["parameters"].items()}
     check_keys(result)
     assert (result["what_if"], result["nuisances"], intervals["spring_2.stiffness"]) == (None, 0, None)

@@ -181,7 +181,7 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "straight a group": (lambda f: f.create_group("straight"), "not a dataset of real numbers", ""),
     "straight of too few": (lambda f: straight(f, rows=2), r"shape \(2, 3\)", ""),
     "another entry at the top": (lambda f: straight(f).move("straight", "straigt"), "'straigt'", "mean 'straight'"),
-    "contents": (lambda f: f["joints/t"].__setitem__(3, 0.0), "from index 2 to 3", "sort by time"),
+    "contents": (lambda f: f["joints/t"].__setitem__(3, 0.0), "from sample 3 to 4", "sort by time"),
 }
 
 

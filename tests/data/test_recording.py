@@ -121,8 +121,8 @@ INVALID: dict[str, tuple[Callable[[], Recording], str]] = {
     "clock offset": (lambda: with_camera(clock_offset_std=-1.0), "clock_offset_std is -1.0"),
     "shape of pose": (lambda: with_camera(camera_pose=np.eye(3)), r"shape \(3, 3\)"),
     "infinite time": (lambda: with_joints(t=changed(T, 7, np.inf)), "time at index 7 is inf"),
-    "time going back": (lambda: with_joints(t=changed(T, 4, 0.02)), r"from index 3 to 4: 0\.03 s, then 0\.02 s"),
-    "time standing": (lambda: with_camera(t=np.zeros(4)), "from index 0 to 1: 0.0 s, then 0.0 s"),
+    "time going back": (lambda: with_joints(t=changed(T, 4, 0.02)), r"from sample 4 to 5: 0\.03 s, then 0\.02 s"),
+    "time standing": (lambda: with_camera(t=np.zeros(4)), "from sample 1 to 2: 0.0 s, then 0.0 s"),
     "NaN position": (
         lambda: with_joints(position=changed(Q, ([5, 6, 8], 1), np.nan)),
         r"'position' has 3 missing or infinite values, the first of joint 'left_s1' at t = 0\.05 s",

@@ -225,7 +225,7 @@ def test_nearest_name():
 
 def test_names_are_listed_once_and_long_lists_are_cut():
     few, many, more = ["b", "a"], [f"joint_{i}" for i in range(30)], [f"frame_{i}" for i in range(70)]
-    assert unknown_name_error_arguments("aXX", few) == {"allowed": "b, a", "hint": "use an allowed name, such as 'a'"}
+    assert unknown_name_error_arguments("aXX", few) == {"allowed": "b, a", "hint": "use one of the allowed names"}
     assert unknown_name_error_arguments("zzz", []) == {"allowed": "none", "hint": "leave 'zzz' out"}
     assert unknown_name_error_arguments("zzz", few, "see --help")["hint"] == "see --help"
     # nothing is near: all of them, for somebody who looks for a name

@@ -105,7 +105,8 @@ def test_a_solve_says_what_is_not_found():
     issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
     both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
     lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
-    assert ("Fix a at a known value" in " ".join(lines), "a (motion too weak). `yid-ocp" in " ".join(lines)) == (True, True)
+    said = " ".join(lines)
+    assert ("Fix a at a known value" in said, "a (motion too weak). `yid-ocp" in said) == (True, True)
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
     parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"

@@ -483,7 +483,7 @@ ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "nothing, no efforts and no commands": ((), "no measurement of the forces that move the arm", "--object"),
-    "no object by name": (("--object", "none"), "there is no object 'none'", "--object beam for a rod"),
+    "no object by name": (("--object", "none"), "there is no object 'none'", "beam for a rod (a configuration"),
     "a length of nothing": (ONE[:2], "--length needs --object", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
@@ -499,7 +499,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "negative length": ((*CABLE, "--length", "-1"), "the length is -1, not above 0", "write --length NUMBER"),
     "grams": ((*CABLE, "--mass", "50"), "'cable' has the density 2e+06 kg/m^3", "--mass"),
     "too many links": ((*CABLE, "--links", "99"), "--links is 99", "--links"),
-    "unknown holder": ((*CABLE, "--holder", "gripper"), "no frame 'gripper'", "an allowed name, such as 'hub'"),
+    "unknown holder": ((*CABLE, "--holder", "gripper"), "no frame 'gripper'", "one of the allowed names"),
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
     "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "not a NAME=NUMBER of", "'tip_radius'?"),
     "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not a NAME=NUMBER of", "tip_radius=0.1\n"),

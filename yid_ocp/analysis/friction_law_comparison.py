@@ -87,8 +87,7 @@ def cross_validate_law_by_motion_kind(
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
         if parts is not None:
             error = np.mean([errors[name] for name in own if name in errors])
-            noise = " of its noise" * (unit == "std")
-            parts.count_done(f"law '{law}' fitted to the other motions: rms error on {kind} {error:.3g} {unit}{noise}")
+            parts.count_done(f"law '{law}' fitted to the other motions: rms error on {kind} {error:.3g} {unit}")
     return CrossValidatedFrictionLawFit(law, errors, unit, solution.status.value == "converged")
 
 

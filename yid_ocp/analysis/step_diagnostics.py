@@ -93,7 +93,7 @@ def equations_and_sensors_per_parameter(
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
     sensors = _sensors(step, episode, state, theta)
     steps = min(_RESPONSE_STEPS, episode.grid.steps)
-    by_row = _answers(step, stages, gain, np.eye(len(names)), sensors, steps)
+    by_row = _answers(step, stages, gain, sensors, steps)
     strength = np.max(by_row, axis=0, initial=0.0)
     found = []
     for i, entry in enumerate(known):
@@ -132,14 +132,14 @@ def _answers(
     step: Step,
     stages: StepResidualsAndJacobians,
     gain: Array,
-    push: Array,
     sensors: Sequence[_WhitenedSensor],
     steps: int,
 ) -> Array:
-    """Return each sensor's largest whitened response (sensors, c) to c inputs `push` in one step."""
+    """Return each sensor's largest whitened response (sensors, rows) to one unit in each row of the first step."""
     sizes, h = step.sizes, step.time_step
-    n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
+    n, nz = sizes["n"], sizes["nz"]
     nt = n + nz + sizes["m"]
+    width = nt + n
     known = list(step.system.prescribed_coordinate_indices)
     solved = np.setdiff1d(np.arange(nt), known)
     new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
@@ -150,7 +150,7 @@ def _answers(
     old, p_old = old - stages.residual_by_input[0] @ gain, p_old - stages.p1_by_input[0] @ gain
     x, largest = np.zeros((sizes["nx"], width)), np.zeros((len(sensors), width))
     for k in range(steps + 1):
-        added = push if k == 0 else np.zeros_like(push)
+        added = np.eye(width) * (k == 0)
         y, effort = np.zeros((nt, width)), np.zeros((n, width))
         y[solved] = -inverse @ (old @ x + added[:nt])[solved]
         effort[known] = -(new @ y + old @ x + added[:nt])[known] / h

@@ -154,9 +154,7 @@ def _few_samples(recording: Recording, span: float) -> Iterator[Issue]:
             first = f" in the first {span:g} s" * (count < len(group.t))
             what = f"{group.name} has only {count_with_noun(count, 'sample')}{first} (at least {least} are needed)"
             severity: IssueSeverity = "not_trusted" if is_serious else "warning"
-            advice = (
-                "set a longer problem.duration" if first else "check whether the file is complete; else record longer"
-            )
+            advice = "set a longer problem.duration" if first else "check if the file is complete; else record longer"
             yield Issue("few_samples", what, severity, least / count, advice, "", group.name)
 
 

@@ -450,12 +450,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
         what = f"the position of point '{group.names[column]}' is {position} m at t = {group.t[row]:g} s"
         allowed, hint = "three finite coordinates, or three NaN", "write three NaN where the point was not seen"
         raise DataError(what, where=f"{where}/position", allowed=allowed, hint=hint)
-    largest, allowed = float(np.abs(group.position[~unseen]).max(initial=0.0)), f"up to {_LARGEST_DISTANCE:g} m"
-    what, hint = (
-        f"a coordinate reaches {largest:g} m",
-        "if the unit is millimetres, import again with --units points=mm",
-    )
-    raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, f"{where}/position", allowed, hint)
+    _check_distances(group.position[~unseen], f"{where}/position")
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]
@@ -470,11 +465,8 @@ def _validate_points(group: PointGroup, where: str) -> None:
 
 
 def _check_distances(positions: Array, where: str) -> None:
-    largest, allowed = float(np.abs(positions).max(initial=0.0)), f"coordinates up to {_LARGEST_DISTANCE:g} m"
-    what, hint = (
-        f"a coordinate reaches {largest:g} m",
-        "if the unit is millimetres, import again with --units points=mm",
-    )
+    largest, hint = float(np.abs(positions).max(initial=0.0)), "if it is in millimetres, import with --units points=mm"
+    what, allowed = f"a coordinate reaches {largest:g} m", f"coordinates in metres, up to {_LARGEST_DISTANCE:g}"
     raise_data_error_unless(largest <= _LARGEST_DISTANCE, what, where, allowed, hint)
 
 

@@ -499,8 +499,9 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    text = "A change of 10 % of any free parameter shows in the readings. `yid-ocp identifiability` tests whether they "
-    text += "can be told apart."
+    text = (
+        "Each free parameter changes the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
+    )
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
         text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
@@ -510,7 +511,6 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    said += " The motion is unstable there, but nothing need be done while simulations succeed." * (radius > 1 + 1e-6)
     yield SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
     yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)

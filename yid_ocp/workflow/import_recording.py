@@ -157,9 +157,7 @@ def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) ->
             matched, present = matched | set(own["column_meanings"]), present.union(names)
         parts.append(read_third_party_recording(file, own, progress))
     if missing := set(columns) - matched:
-        said = unknown_name_error_arguments(
-            min(missing), sorted(present), "write COLUMN=MEANING with a column of a file"
-        )
+        said = unknown_name_error_arguments(min(missing), sorted(present), "write COLUMN=MEANING for each column")
         raise DataError(f"no file has a column '{min(missing)}'", where="--columns", **said)
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):

@@ -19,13 +19,9 @@ from yid_ocp.display import NULL_PROGRESS, Progress, effect_entry_label
 from yid_ocp.export.signals import export_recording_csv_files, joint_trajectory_message
 from yid_ocp.files import attributes_to_dict, write_text
 from yid_ocp.integrator.step import Step
+from yid_ocp.planning import motion_plan
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import (
-    ParameterCovarianceBeforePlan,
-    TargetMotionPlan,
-    moved_point_and_boxed_frames,
-    plan_motion_to_target,
-)
+from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan
 from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
 from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
@@ -59,12 +55,13 @@ def run_plan(
             if run.model.arms.mode == "servo":  # prescribed arms have no parameters of servos
                 run = replace(run, parameters={k: own for k, own in run.parameters.items() if ".servo_" not in k})
             with add_setting_location_to_errors(run, "plan"):
-                moved_point_and_boxed_frames(build_system(run), run.plan)  # reports a missing point before the compiler
+                # reports a missing point before the model is compiled
+                motion_plan.moved_point_and_boxed_frames(build_system(run), run.plan)
             step = _compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
             with add_setting_location_to_errors(run, "plan"):
-                found = plan_motion_to_target(step, options, theta, known, progress)
+                found = motion_plan.plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
         export_recording_csv_files(recording, folder.path / "csv")
