@@ -274,20 +274,10 @@ track:
   options:
     filters: {box_lower: [0.2, -0.8, -0.9], box_upper: [1.5, 0.8, 0.8], robot_padding: 0.02}    # [m]
 """,
-    "track.options.skeleton": """\
-track:
-  options:
-    skeleton: {neighbour_radius: 0.05, max_cloud_points_per_node: 30}     # [m]
-""",
-    "track.options.shape_fit": """\
-track:
-  options:
-    shape_fit: {surface_loss_scales: [], surface_noise_std: 0.004}  # [m]
-""",
     "track.options.calibration": """\
 track:
   options:
-    calibration: {fix_pose: true, translation_prior_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
+    calibration: {fix_pose: true}    # a hand-eye calibration
 """,
     "track.options.clock_offset_search": """\
 track:

@@ -213,7 +213,7 @@ ANY_NUMBER = {
     "import.gear_ratios.NAME", "sensors.NAME.constants.NAME", "sensors.NAME.constants.NAME.NAME",
     "model.arms.locked_joints.NAME", "model.joint_springs.NAME.rest_position", "model.effects.values.NAME",
     "parameters.NAME.initial", "track.virtual_frames.latency", "track.options.filters.floor_height",
-    "track.options.filters.floor_margin_above_object_foot", "track.options.filters.max_depth_behind_robot_base",
+    "track.options.filters.max_depth_behind_robot_base",
     "track.options.clock_offset_search.initial_stamp_minus_joint_time",
 }  # fmt: skip
 

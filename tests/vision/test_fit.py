@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import DataError
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import ShapeFitOptions
 from yid_ocp.vision.fit import ShapeFitter, _Task
 from yid_ocp.vision.shape_evidence import ProcessedFrameCloud
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
@@ -74,12 +73,6 @@ def test_twists_stay_at_rest_and_a_fit_starts_from_where_it_was(alone, whole):
     assert off(fit, whole, q) < 0.002
     q = bent(whole, 5, 0.3)
     assert off(whole.fit_frame(seen(whole, q), 0 * q, [q + 0.02]), whole, q) < 0.004
-
-
-def test_nodes_alone_are_the_papers_fit(alone):
-    shape = ShapeFitter(alone, ShapeFitOptions(node_loss_scales=(0.15, 0.05, 0.02), surface_loss_scales=()))
-    q = bent(shape, 2, 0.08)
-    assert off(shape.fit_frame(seen(shape, q), 0 * q), shape, q) < 0.015
 
 
 def test_surface_and_centre_line_are_told_apart(alone, whole):
@@ -166,5 +159,3 @@ def test_what_cannot_be_fitted_is_said(whole, urdf_folder):
         ShapeFitter(System.build(read_urdf(urdf_folder / "double_pendulum.urdf")))
     with pytest.raises(DataError, match="no point"):
         whole.fit_frame(sight, whole.rest_configuration)
-    with pytest.raises(ConfigError, match="are both empty"):
-        ShapeFitOptions(node_loss_scales=(), surface_loss_scales=())

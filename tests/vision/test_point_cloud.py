@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision import CloudFilterOptions, ShapeFitOptions, SkeletonOptions, TrackOptions
+from yid_ocp.vision import CloudFilterOptions, TrackOptions
 from yid_ocp.vision.point_cloud import (
     ReachableObjectRegion,
     WeightedCloud,
@@ -12,7 +12,7 @@ from yid_ocp.vision.point_cloud import (
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes_by_joint
 
-CAMERA, SKELETON = np.array([2.6, 0.0, 0.45]), SkeletonOptions()
+CAMERA, DIAMETER = np.array([2.6, 0.0, 0.45]), 0.04
 
 
 def test_voxels_keep_weight_and_centroid():
@@ -72,9 +72,8 @@ def test_where_the_object_can_be(system, run):
     ("options", "name"),
     [
         (CloudFilterOptions, "robot_padding"),
-        (SkeletonOptions, "neighbour_radius"),
         (TrackOptions, "max_mean_surface_distance_in_radii"),
-        (ShapeFitOptions, "surface_noise_std"),
+        (TrackOptions, "surface_noise_std"),
     ],
 )
 def test_options_are_checked(options, name):
@@ -108,7 +107,7 @@ def from_bones(points):
 
 def test_nodes_and_edges_are_a_tree_on_the_centre_lines_from_the_lowest_point():
     cloud = letter()
-    found, again, other = (extract_skeleton_graph(cloud, np.random.default_rng(seed), SKELETON) for seed in (0, 0, 2))
+    found, again, other = (extract_skeleton_graph(cloud, np.random.default_rng(seed), DIAMETER) for seed in (0, 0, 2))
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
@@ -132,7 +131,7 @@ def test_two_parts_and_a_stray_heap():
     far = np.random.default_rng(3).normal([0.5, 0.5, 0.5], 0.01, (60, 3))
     near = np.abs(cloud.points[:, 2] - 0.4) > 0.15  # a gap across the trunk
     points = np.concatenate([cloud.points[near], far])
-    found = extract_skeleton_graph(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0), SKELETON)
+    found = extract_skeleton_graph(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0), DIAMETER)
     assert set(found.component_of_node.tolist()) == {0, 1}
     assert not (found.node_of_point >= 0)[-60:].any()
     weights = np.bincount(found.component_of_node[found.node_of_point[found.node_of_point >= 0]])
@@ -141,14 +140,13 @@ def test_two_parts_and_a_stray_heap():
 
 def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it(monkeypatch):
     few = WeightedCloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
-    assert len(extract_skeleton_graph(few, np.random.default_rng(0), SKELETON).nodes) == 0
-    empty = extract_skeleton_graph(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0), SKELETON)
+    assert len(extract_skeleton_graph(few, np.random.default_rng(0), DIAMETER).nodes) == 0
+    empty = extract_skeleton_graph(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0), DIAMETER)
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
-    found = extract_skeleton_graph(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0), SKELETON)
+    found = extract_skeleton_graph(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0), DIAMETER)
     assert len(found.nodes) == 10
     assert (found.node_of_point >= 0).all()
     angle = np.arange(40)
-    ring = WeightedCloud(0.069 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), np.ones(40))
-    lonely = SkeletonOptions(neighbour_radius=0.01)
+    ring = WeightedCloud(0.5 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), np.ones(40))
     monkeypatch.setattr("yid_ocp.vision.point_cloud._MIN_SEGMENT_POINTS", 1)
-    assert len(extract_skeleton_graph(ring, np.random.default_rng(0), lonely).nodes)
+    assert len(extract_skeleton_graph(ring, np.random.default_rng(0), 0.0).nodes)

@@ -21,7 +21,7 @@ RADIUS = 0.006
 TABLE = look_at_pose([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0, 1, 0))
 WALL = look_at_pose([1.2, 0.0, -0.4], [0.0, 0.0, -0.4])
 FILTERS = vision.CloudFilterOptions(voxel_size=0.004)
-OPTIONS = TrackOptions(root_placement="free", filters=FILTERS, min_point_std=0.002)
+OPTIONS = TrackOptions(root_placement="free", filters=FILTERS)
 CONFIG = """\
 model:
   robot: null

@@ -103,7 +103,7 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     assert group.names == system.point_frames
     assert np.array_equal(group.t, clean.track.t)
     assert np.array_equal(group.position, clean.track.position)
-    assert (group.std >= TrackOptions().min_point_std).all()
+    assert (group.std >= 0.002).all()
     assert np.array_equal(group.camera_pose, clean.track.camera_calibration.camera_state.pose)
     assert again.description.startswith("Before.")
     assert "clock offset" in again.description

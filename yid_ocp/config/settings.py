@@ -353,7 +353,6 @@ class _VirtualFramesSettings:
     dropped_frame_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of frames that are lost")] = 0.0
     latency: Annotated[float, OptionInfo("stamp minus time of the image", "s")] = 0.0
     latency_std: Annotated[float, Ge(0), OptionInfo("standard deviation of the latency", "s")] = 0.0
-    outlier_fraction: Annotated[float, Ge(0), Lt(1), OptionInfo("fraction of pixels with a wrong depth")] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +378,7 @@ class _TrackSettings:
     )
     write_virtual_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
     n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("number of frames with drawings of every stage")] = 2
-    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and acceptance of frames")] = field(
+    options: Annotated[TrackOptions, OptionInfo("filters, clock, calibration and acceptance of frames")] = field(
         default_factory=TrackOptions
     )
 

@@ -5,14 +5,12 @@ Letters in shapes: N points of a cloud, K links or skeleton nodes, np points of 
 
 from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions as ArmBasedCameraCalibrationOptions
 from yid_ocp.vision.calibration import CameraClockOptions as CameraClockOptions
-from yid_ocp.vision.fit import ShapeFitOptions as ShapeFitOptions
 from yid_ocp.vision.frame_folder import write_frame_folder as write_frame_folder
 from yid_ocp.vision.frame_selection import TrackOptions as TrackOptions
 from yid_ocp.vision.frames import CameraIntrinsics as CameraIntrinsics
 from yid_ocp.vision.frames import FrameSequence as FrameSequence
 from yid_ocp.vision.frames import look_at_pose as look_at_pose
 from yid_ocp.vision.point_cloud import CloudFilterOptions as CloudFilterOptions
-from yid_ocp.vision.point_cloud import SkeletonOptions as SkeletonOptions
 from yid_ocp.vision.surface_meshes import DepthCameraModel as DepthCameraModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.surface_meshes import SceneDescription as SceneDescription

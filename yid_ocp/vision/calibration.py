@@ -18,7 +18,7 @@ from annotated_types import Ge
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
-from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
+from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.vision.camera_registration import (
     CAMERA_STATE_SIZE,
     CLOCK_DRIFT_INDEX,
@@ -54,6 +54,7 @@ _MIN_POINT_STD = 1e-3  # [m]
 _MAX_CLOCK_STEP = 0.05  # largest change of an offset in one iteration [s]
 _MAX_STAMP_DELAY = 0.03  # deviation of a stamp from the common offset that is allowed, as are four stds [s]
 _DRIFT_PRIOR_STD, _MAX_CLOCK_OFFSET_STD = 1e-3, 0.02  # of the camera's clock: std of its drift; largest std [s]
+_ROTATION_PRIOR_STD, _TRANSLATION_PRIOR_STD = 0.06, 0.04  # of a specified pose, along each axis [rad], [m]
 _DEPTH_SCALE_PRIOR_STD, _DEPTH_OFFSET_PRIOR_STD = 0.03, 0.01  # [-], [m]
 _MIN_ARM_COVERAGE = 0.6  # fraction of the arm's visible, unoccluded surface that must coincide with points
 
@@ -159,7 +160,7 @@ _CONTRADICTION_STDS = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class ArmBasedCameraCalibrationOptions:
-    """The settings of the camera calibration by the visible arm: which parts are estimated, frames, and priors."""
+    """The settings of the camera calibration by the visible arm: which parts are estimated, and from which frames."""
 
     fix_pose: Annotated[
         bool,
@@ -171,12 +172,6 @@ class ArmBasedCameraCalibrationOptions:
     n_frames: Annotated[
         int, Ge(_MIN_FRAMES), OptionInfo("number of frames, spread over the sequence, that are compared with the arm")
     ] = 24
-    rotation_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the specified orientation, about each axis", "rad")
-    ] = 0.06
-    translation_prior_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of the specified position, along each axis", "m")
-    ] = 0.04
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "calibration options")
@@ -273,8 +268,7 @@ class _Calibrator:
     @cached_property
     def precision(self) -> Array:
         """Inverse covariance (10, 10) of the prior."""
-        own = self.options
-        pose = [*[own.rotation_prior_std] * 3, *[own.translation_prior_std] * 3]
+        pose = [_ROTATION_PRIOR_STD] * 3 + [_TRANSLATION_PRIOR_STD] * 3
         # uniform distribution over the search range; zero without a search
         offset = max(self.clock.search_half_width / math.sqrt(3.0), 1e-6)
         std = [*pose, _DEPTH_SCALE_PRIOR_STD, _DEPTH_OFFSET_PRIOR_STD, offset, _DRIFT_PRIOR_STD]

@@ -13,21 +13,20 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import partial
 from itertools import pairwise
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import DataError
 from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.system import System
-from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision import shape_evidence
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud, ShapeFitQualityAndPointClasses
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd, ShapeGuessFinder
@@ -36,7 +35,11 @@ from yid_ocp.vision.surface_meshes import model_link_lengths_and_radius_by_segme
 _Left = tuple[BoolArray, BoolArray]  # masks of the nodes and points of a frame that are used
 _NODE_RADIUS_FRACTION = math.pi / 4  # distance of the mean of a tube's visible half from its axis, over the radius
 _END_OFFSET_STDS = 3.0  # stds of a point beyond which an end differs from the shape
-_MAX_POINT_DISTANCE_SCALES = 3.0  # in last loss scales; points further away carry no information on the shape
+SURFACE_NOISE_STD = 0.006  # of one averaged point of usual depth cameras [m]
+_NODE_LOSS_SCALES = (0.15, 0.05)  # of the robust loss, per pass: wide first, for poor initial shapes [m]
+_SURFACE_LOSS_SCALES = (0.03, 0.015)  # of the loss on points, per pass [m]
+MAX_INFORMATIVE_SURFACE_DISTANCE = 3.0 * _SURFACE_LOSS_SCALES[-1]  # points beyond carry no information [m]
+_GRASP_POSITION_STD = 0.004  # between a gripper, by joint angles, and the grasped point [m]
 _TOUCHING_DISTANCE = 1e-3  # [m]
 _MIN_STIFFNESS_FRACTION = 1e-2  # lower bound of a bend's stiffness, relative to the mean
 _WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; determines what no point shows, such as the roll of a straight rope
@@ -50,48 +53,22 @@ _MIN_TUBE_COVERAGE = 0.75  # a tube with points on a smaller fraction of its vis
 _PASS_TOLERANCE = 1e-4  # change of a bend [rad] and relative change of the cost at which a pass ends
 
 
-@dataclass(frozen=True)
-class ShapeFitOptions:
-    """The settings of the shape fit."""
-
-    node_loss_scales: Annotated[
-        tuple[PositiveFloat, ...],
-        OptionInfo("scale of the robust loss on skeleton nodes, per pass: wide first, for poor initial shapes", "m"),
-    ] = (0.15, 0.05)
-    surface_loss_scales: Annotated[
-        tuple[PositiveFloat, ...],
-        OptionInfo("scale of the loss on points, per pass; empty: a fit to nodes only, as Caldwell et al.", "m"),
-    ] = (0.03, 0.015)
-    surface_noise_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
-    ] = 0.006
-    grasp_position_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation between a gripper, by joint angles, and the grasped point", "m")
-    ] = 0.004
-
-    def __post_init__(self) -> None:
-        check_option_bounds(self, "fit options")
-        if not self.node_loss_scales and not self.surface_loss_scales:
-            what, where = "node_loss_scales and surface_loss_scales are both empty", "track.options.shape_fit"
-            raise ConfigError(what, where=where, allowed="one scale or more [m]", hint="set node_loss_scales: [0.05]")
-
-
 class ShapeFitter:
     """A fitter of a flexible object's bending angles to camera points. Parameters default to nominal values.
 
-    The joints in `loose`, such as a free root (`shape_guesses.add_free_root_joints`), are fitted too, with an almost
-    flat prior. Raises `DataError` if the system has no object.
+    `surface_noise_std` is the standard deviation of an averaged point's distance from the surface [m]. The joints in
+    `loose`, such as a free root (`shape_guesses.add_free_root_joints`), are fitted too, with an almost flat prior.
+    Raises `DataError` if the system has no object.
     """
 
     def __init__(
         self,
         system: System,
-        options: ShapeFitOptions | None = None,
         values: Mapping[str, float] | None = None,
         loose: Sequence[str] = (),
+        surface_noise_std: float = SURFACE_NOISE_STD,
     ) -> None:
-        self.system = system
-        self.options = options or ShapeFitOptions()
+        self.system, self.surface_noise_std = system, surface_noise_std
         if not system.segment_layouts:
             what, hint = "the model has no object whose shape could be fitted", "set model.object, such as kind: foam_y"
             raise DataError(what, where="model.object", allowed="an object made of segments", hint=hint)
@@ -102,7 +79,7 @@ class ShapeFitter:
         self._free_joint_segments = (*(owner.get(entry.joint_name, "") for entry in bends), *[""] * len(loose))
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in system.mechanism.joint_names if name not in sought)
-        self._symbolic = _symbolic_functions(system, self.options, self.free_joints)
+        self._symbolic = _symbolic_functions(system, self.free_joints)
         self._set_values(values)
 
     def with_parameter_values(self, values: Mapping[str, float] | None) -> ShapeFitter:
@@ -193,7 +170,7 @@ class ShapeFitter:
         self, best: _BestFit, evidence: ShapeFitQualityAndPointClasses, sight: ProcessedFrameCloud
     ) -> list[Array]:
         """Configurations of other shapes that may fit the cloud, one for each tube that a foreign object touches."""
-        if not evidence.is_contested.any() or not self.options.surface_loss_scales:
+        if not evidence.is_contested.any():
             return []
         tubes, contested = self.tube_links_at_configuration(best.q), sight.points[evidence.is_contested]
         touched = shape_evidence.nearest_link_axis_projections(tubes.link_ends, tubes.radius, contested)[0]
@@ -232,32 +209,26 @@ class ShapeFitter:
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_BestFit(start, unit, math.inf), on_nodes) for start in starts]
         last = self._minimise(min(tried, key=lambda minimum: minimum.cost), on_points)
-        near = self.max_informative_surface_distance
+        near = MAX_INFORMATIVE_SURFACE_DISTANCE
         evidence = shape_evidence.fit_quality_and_point_classes(self.tube_links_at_configuration(last.q), sight, near)
         keep = ~(evidence.is_contested | evidence.is_foreign)
-        if on_points and keep.any():
+        if keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
             tubes = self.tube_links_at_configuration(last.q)
             evidence = shape_evidence.fit_quality_and_point_classes(tubes, sight, near)
         return last, evidence
 
-    @property
-    def max_informative_surface_distance(self) -> float:
-        """The distance [m] from the surface beyond which points carry no information on the shape."""
-        return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
-
     def _tasks(
         self, sight: ProcessedFrameCloud, at_nodes: BoolArray, at_points: BoolArray
     ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the chosen nodes, and the passes on the chosen points."""
-        options, camera = self.options, sight.camera_position
-        factor = 1.0 / (_CORRELATED_POINTS * options.surface_noise_std**2)
+        camera, factor = sight.camera_position, 1.0 / (_CORRELATED_POINTS * self.surface_noise_std**2)
         weight = np.minimum(sight.point_weights, _MAX_POINT_WEIGHT)[at_points]
         nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
         # nodes together weigh as much as the points, whose errors they share
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
         on_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
-        both = (on_nodes, options.node_loss_scales), (on_surface, options.surface_loss_scales)
+        both = (on_nodes, _NODE_LOSS_SCALES), (on_surface, _SURFACE_LOSS_SCALES)
         nodes_first, points_then = ([_Task(*of, s, camera, sight.end_anchors) for s in scales] for of, scales in both)
         return nodes_first, points_then
 
@@ -289,9 +260,9 @@ class ShapeFitter:
         places = points.reshape(-1, 3)
         spread = np.diag(jacobian @ np.linalg.solve(best.hessian, jacobian.T)).reshape(-1, 3)
         none = np.zeros(len(sight.skeleton_nodes), bool)
-        own = self._tasks(sight, none, ~(evidence.is_contested | evidence.is_foreign))[1][-1:]
+        own = self._tasks(sight, none, ~(evidence.is_contested | evidence.is_foreign))[1][-1]
         moved = np.zeros(places.shape)
-        if own and evidence.is_contested.any():
+        if evidence.is_contested.any():
             # how far the contested points would take the shape, if they counted
             every = self._tasks(sight, none, ~evidence.is_foreign)[1][-1]
             moved = (jacobian @ self._quadratic(q, every).damped_step(0.0)).reshape(-1, 3)
@@ -303,7 +274,7 @@ class ShapeFitter:
         across = shape_evidence.link_normals_perpendicular_to_sight(corners, sight.camera_position)
         wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
-        off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
+        off_end, noise = np.zeros(places.shape), max(self.surface_noise_std, evidence.noise_std)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if abs(offset) > _END_OFFSET_STDS * noise:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING_DISTANCE
@@ -321,7 +292,7 @@ class ShapeFitter:
             is_point_seen=np.asarray(seen),
             grasp_gaps=np.array(self._gap(q)).reshape(-1, 3),
             contested_fraction=float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
-            dimension_equations=self._size_rows(q, own[0] if own else None, evidence),
+            dimension_equations=self._size_rows(q, own, evidence),
             link_ends=corners,
         )
 
@@ -366,7 +337,7 @@ class ShapeFitter:
         return ShapeGuessFinder(self.system, tree, self.rest_configuration, self.bend_joints, lengths)
 
     def _size_rows(
-        self, q: Array, task: _Task | None, evidence: ShapeFitQualityAndPointClasses
+        self, q: Array, task: _Task, evidence: ShapeFitQualityAndPointClasses
     ) -> shape_evidence.QuadraticTubeDimensionCost:
         """Cost of tube lengths and radii in a frame, from the points of the pass `task` at the fitted shape `q`."""
         names = [segment.name for segment in self.system.segment_layouts]
@@ -382,21 +353,20 @@ class ShapeFitter:
             gradient[:] += weighted.T @ error
             hessian[:] += weighted.T @ rows
 
-        if task is not None:
-            depths = shape_evidence.surface_residuals_along_sight(corners, self.link_radii, task.points, task.camera)
-            weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
-            segment = np.array([names.index(owner) for owner in self.link_segments])
-            for k in range(len(self.link_radii)):
-                mine = depths.link_indices == k
-                rows = np.zeros((int(mine.sum()), total))
-                rows[:, : free + many] = depths.jacobian_by_link_ends[mine] @ chain[6 * k : 6 * k + 6]
-                rows[:, free + many + segment[k]] = depths.derivative_by_radius[mine] * self.link_radii[k]
-                add(rows, depths.signed_distance[mine], weight[mine])
+        depths = shape_evidence.surface_residuals_along_sight(corners, self.link_radii, task.points, task.camera)
+        weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
+        segment = np.array([names.index(owner) for owner in self.link_segments])
+        for k in range(len(self.link_radii)):
+            mine = depths.link_indices == k
+            rows = np.zeros((int(mine.sum()), total))
+            rows[:, : free + many] = depths.jacobian_by_link_ends[mine] @ chain[6 * k : 6 * k + 6]
+            rows[:, free + many + segment[k]] = depths.derivative_by_radius[mine] * self.link_radii[k]
+            add(rows, depths.signed_distance[mine], weight[mine])
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if np.isfinite(offset):
                 rows = np.zeros((1, total))
                 rows[0, : free + many] = -shape_evidence.unit_link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
-                noise = max(self.options.surface_noise_std, evidence.noise_std)
+                noise = max(self.surface_noise_std, evidence.noise_std)
                 add(rows, np.array([offset]), np.array([1.0 / noise**2]))
         held, by_held = self._held(q)
         add(np.hstack([by_held, held_by_length, np.zeros((len(held), many))]), held.ravel(), np.ones(len(held)))
@@ -442,7 +412,7 @@ class _Task(NamedTuple):
     anchors: Sequence[ObservedObjectEnd]
 
 
-def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: Sequence[int]) -> dict[str, ca.Function]:
+def _symbolic_functions(system: System, free_joints: Sequence[int]) -> dict[str, ca.Function]:
     """Functions of the configuration and of all parameters, by name.
 
     `corners` (ends of the links), `seen` (points of the system) and `held` (errors of held frames, in standard
@@ -459,7 +429,7 @@ def _symbolic_functions(system: System, options: ShapeFitOptions, free_joints: S
     for grasp in system.grasps:
         residual, alignment = grasp.constraint_residual(kinematics), grasp.holder_minus_held_axis_directions(kinematics)
         gaps.append(residual[:3])
-        rows.append(residual[:3] / options.grasp_position_std)
+        rows.append(residual[:3] / _GRASP_POSITION_STD)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
             rows.append(alignment[-3:] / _GRASP_DIRECTION_STD)
     seen = ca.vertcat(*(kinematics.frame_position(name) for name in system.point_frames))

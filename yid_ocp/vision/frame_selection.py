@@ -15,10 +15,10 @@ from scipy.sparse.csgraph import shortest_path
 from yid_ocp.arrays import Array
 from yid_ocp.display import grouped
 from yid_ocp.errors import DataError
-from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.calibration import ArmBasedCameraCalibrationOptions, CameraClockOptions
-from yid_ocp.vision.fit import ShapeFitOptions, ShapeFitter
-from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzTuple
+from yid_ocp.vision.fit import SURFACE_NOISE_STD, ShapeFitter
+from yid_ocp.vision.point_cloud import CloudFilterOptions, XyzTuple
 from yid_ocp.vision.sequence_calibration import (
     ForeignObject,
     SequenceEstimates,
@@ -36,8 +36,6 @@ class TrackOptions:
     filters: Annotated[CloudFilterOptions, OptionInfo("selection of the object's points")] = field(
         default_factory=CloudFilterOptions
     )
-    skeleton: Annotated[SkeletonOptions, OptionInfo("skeleton of a cloud")] = field(default_factory=SkeletonOptions)
-    shape_fit: Annotated[ShapeFitOptions, OptionInfo("fit of a shape")] = field(default_factory=ShapeFitOptions)
     clock_offset_search: Annotated[
         CameraClockOptions, OptionInfo("estimation of the camera clock's offset from the joints' clock")
     ] = field(default_factory=CameraClockOptions)
@@ -60,17 +58,12 @@ class TrackOptions:
         PositiveFloat,
         OptionInfo("mean distance of points from the shape, beyond noise, that drops a frame; in tube radii"),
     ] = 0.5
-    min_covered_visible_length_fraction: Annotated[
-        UnitIntervalFloat,
-        OptionInfo("a frame is dropped if points cover a smaller fraction of the object's visible length"),
-    ] = 0.6
     max_seen_point_std: Annotated[
         PositiveFloat, OptionInfo("a point with a larger standard deviation in a frame counts as not seen", "m")
     ] = 0.02
-    min_point_std: Annotated[
-        PositiveFloat,
-        OptionInfo("lower bound of a point's standard deviation, for straight links in place of a curve", "m"),
-    ] = 0.002
+    surface_noise_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
+    ] = SURFACE_NOISE_STD
     frame_stamp_std: Annotated[
         float, Ge(0), OptionInfo("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
@@ -100,6 +93,8 @@ _MISFIT_REASONS = (_NO_FIT, _END_ELSEWHERE)
 _MAX_BEND_ANGLE = 1.2  # of a joint in a good frame [rad]
 _MAX_DISTANCE_OVER_MEDIAN = 1.7  # of a frame's mean distance, over the median of good frames
 _MAX_GRASP_GAP_CHANGE = 0.008  # distance of an end from its gripper, beyond the usual, of a wrong stamp [m]
+_MIN_COVERED_VISIBLE_LENGTH_FRACTION = 0.6  # of the object, by points, in a good frame
+_MIN_POINT_STD = 0.002  # lower bound of a point's std, for straight links in place of a curve [m]
 _MAX_NOTES = 2  # notes in a hint
 _MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # mean absolute deviation of a normal variable, in stds
 
@@ -110,7 +105,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return "the fit of the shape failed (its angles are not finite)"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest = options.max_mean_surface_distance_in_radii * float(shape.link_radii.mean())
-    limit = math.hypot(widest, _MEAN_ABS_DEVIATION * shape.options.surface_noise_std)
+    limit = math.hypot(widest, _MEAN_ABS_DEVIATION * shape.surface_noise_std)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
@@ -120,10 +115,9 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     if bend > _MAX_BEND_ANGLE:
         most = f"but only {math.degrees(_MAX_BEND_ANGLE):.0f} degrees are allowed"
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees, {most}"
-    if fit.visible_length_coverage < options.min_covered_visible_length_fraction:
-        seen, least = (100 * x for x in (fit.visible_length_coverage, options.min_covered_visible_length_fraction))
-        most = f"track.options.min_covered_visible_length_fraction requires {least:.0f} %"
-        return f"{_NO_FIT}: only {seen:.0f} % of its visible length has points of its own, but {most}"
+    if fit.visible_length_coverage < _MIN_COVERED_VISIBLE_LENGTH_FRACTION:
+        seen, least = (100 * x for x in (fit.visible_length_coverage, _MIN_COVERED_VISIBLE_LENGTH_FRACTION))
+        return f"{_NO_FIT}: only {seen:.0f} % of its visible length has points of its own, not at least {least:.0f} %"
     return None
 
 
@@ -174,7 +168,7 @@ def times_configurations_points_of_good_frames(
     t = np.array([frames[k].joint_time for k in good])
     position = np.array([fit.point_positions[of] for fit in fits])
     by_sizes = np.array([sizes.point_std_from_dimensions(fit.dimension_equations.point_jacobian[of]) for fit in fits])
-    std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
+    std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), _MIN_POINT_STD), by_sizes)
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is measured at a uniformly distributed time within the exposure
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.frame_stamp_std, options.exposure_time / math.sqrt(12.0)))

@@ -29,6 +29,10 @@ _SPACING_SAMPLE_POINTS = 3000  # smallest number of points that estimate the usu
 _MAX_COLOUR_ANGLE = 0.2  # angle to a colour of the object, as directions of linear light [rad]
 _OUTLIER_NEIGHBOURS, _OUTLIER_Z_MAX = 12, 4.0  # neighbours of an isolated point; robust stds of their mean distance
 _REACH_MARGIN = 0.1  # beyond the longest branch, from the object's root [m]
+_FLOOR_MARGIN_ABOVE_OBJECT_FOOT = 0.05  # the floor and points that it scatters are lower [m]
+_MAX_CLOUD_POINTS_PER_NODE = 50  # points per segment of the skeleton, k1 in Caldwell et al.
+_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS = 0.07, 1.25  # neighbours: more than across a tube [m], [-]
+MAX_EDGE_LENGTH = 0.15  # largest distance of connected nodes of the skeleton [m]
 _MIN_SEGMENT_POINTS = 15  # a segment of the skeleton with fewer points gives no node
 _NODE_NEIGHBOURS = 4  # of a node in the skeleton's graph
 _MIN_COMPONENT_FRACTION = 0.04  # of the points; a smaller connected part is not part of the object
@@ -66,12 +70,11 @@ class CloudFilterOptions:
     floor_height: Annotated[
         float | None,
         OptionInfo(
-            "points below this height are removed; default: points less than floor_margin_above_object_foot above "
-            "the foot of an object that stands on one",
+            "points below this height are removed; default: points less than 5 cm above the foot of an object that "
+            "stands on one",
             "m",
         ),
     ] = None
-    floor_margin_above_object_foot: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     max_depth_behind_robot_base: Annotated[
         float | None,
         OptionInfo(
@@ -120,7 +123,7 @@ class ReachableObjectRegion:
             rest = np.zeros(system.n_coordinates)
             root = float(self._root(rest)[2])
             if np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2].min() > root:
-                low = root + options.floor_margin_above_object_foot
+                low = root + _FLOOR_MARGIN_ABOVE_OBJECT_FOOT
         self._lower = np.full(3, -np.inf) if options.box_lower is None else np.array(options.box_lower, float)
         self._upper = np.full(3, np.inf) if options.box_upper is None else np.array(options.box_upper, float)
         self._lower[2] = max(self._lower[2], low)
@@ -216,21 +219,6 @@ def weighted_median(values: Array, weight: Array) -> float:
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-@dataclass(frozen=True)
-class SkeletonOptions:
-    """The settings of the skeleton extraction."""
-
-    max_cloud_points_per_node: Annotated[int, Ge(2), OptionInfo("points per segment, k1 in Caldwell et al.")] = 50
-    neighbour_radius: Annotated[
-        PositiveFloat,
-        OptionInfo("largest distance of neighbours; somewhat more than the thickest tube's diameter", "m"),
-    ] = 0.07
-    max_edge_length: Annotated[PositiveFloat, OptionInfo("largest distance of connected nodes", "m")] = 0.15
-
-    def __post_init__(self) -> None:
-        check_option_bounds(self, "skeleton options")
-
-
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
     """The skeleton of a cloud: nodes, edges that connect them without cycles, and the node of each point."""
@@ -242,7 +230,7 @@ class CloudSkeleton:
 
 
 def _thin_to_nodes(
-    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions
+    cloud: WeightedCloud, rng: np.random.Generator, neighbour_radius: float
 ) -> tuple[Array, Array, IntArray]:
     """Thin a cloud to nodes, segment by segment. Returns nodes (K, 3), their weights (K,), and points' nodes (N,)."""
     label, alive = np.full(len(cloud), -1), np.arange(len(cloud))
@@ -251,8 +239,8 @@ def _thin_to_nodes(
     seed = points[int(np.argmin(points[:, 2]))] if len(points) else np.zeros(3)
 
     while len(alive):
-        first = _near(points, seed, options)
-        centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), options)
+        first = _near(points, seed, neighbour_radius)
+        centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), neighbour_radius)
         if not len(centred):  # a ring around its own centre: use the segment itself to continue
             centred = first
         centre = np.average(points[centred], axis=0, weights=weight[centred])
@@ -266,26 +254,26 @@ def _thin_to_nodes(
         if len(alive):
             square = _square_distances(points, centre)
             nearest = int(np.argmin(square))
-            seed = points[nearest if square[nearest] <= options.neighbour_radius**2 else rng.integers(len(alive))]
+            seed = points[nearest if square[nearest] <= neighbour_radius**2 else rng.integers(len(alive))]
     return np.array(nodes).reshape(-1, 3), np.array(size), label
 
 
-def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
-    """Indices of the points nearest to a centre, within `neighbour_radius`, at most `max_cloud_points_per_node`."""
-    square, within = _square_distances(points, centre), options.neighbour_radius**2
-    if len(square) > options.max_cloud_points_per_node:
-        found = np.argpartition(square, options.max_cloud_points_per_node - 1)[: options.max_cloud_points_per_node]
+def _near(points: Array, centre: Array, neighbour_radius: float) -> IntArray:
+    """Indices of the points nearest to a centre, within `neighbour_radius`, at most `_MAX_CLOUD_POINTS_PER_NODE`."""
+    square, within = _square_distances(points, centre), neighbour_radius**2
+    if len(square) > _MAX_CLOUD_POINTS_PER_NODE:
+        found = np.argpartition(square, _MAX_CLOUD_POINTS_PER_NODE - 1)[:_MAX_CLOUD_POINTS_PER_NODE]
         return np.asarray(found[square[found] <= within])
     return np.flatnonzero(square <= within)
 
 
-def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, IntArray]:
+def _spanning_forest(nodes: Array) -> tuple[IntArray, IntArray]:
     """Edges (E, 2) of the shortest forest that connects near nodes, and the connected part (K,) of each node."""
     count = len(nodes)
     if count < 2:
         return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
     k = min(_NODE_NEIGHBOURS + 1, count)
-    distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=options.max_edge_length)
+    distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=MAX_EDGE_LENGTH)
     rows = np.repeat(np.arange(count), k)
     columns, lengths = index.ravel(), distance.ravel()
     good = np.isfinite(lengths) & (columns != rows)
@@ -296,10 +284,14 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, 
     return np.column_stack([forest.row, forest.col]).astype(np.int64), part.astype(np.int64)
 
 
-def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions) -> CloudSkeleton:
-    """Extract the skeleton of a cloud, which is thinned from its lowest point on. Small connected parts are omitted."""
-    nodes, size, label = _thin_to_nodes(cloud, rng, options)
-    edges, part = _spanning_forest(nodes, options)
+def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, diameter: float) -> CloudSkeleton:
+    """Extract the skeleton of a cloud, which is thinned from its lowest point on. Small connected parts are omitted.
+
+    `diameter` [m] is that of the thickest tube.
+    """
+    neighbour_radius = max(_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS * diameter)
+    nodes, size, label = _thin_to_nodes(cloud, rng, neighbour_radius)
+    edges, part = _spanning_forest(nodes)
     if not len(nodes):
         return CloudSkeleton(nodes, label, edges, part)
     held = np.bincount(part, size)
@@ -307,5 +299,5 @@ def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, optio
     keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()
     renamed = np.full(len(nodes) + 1, -1)
     renamed[:-1][keep] = np.arange(int(keep.sum()))
-    edges, _ = _spanning_forest(nodes[keep], options)
+    edges, _ = _spanning_forest(nodes[keep])
     return CloudSkeleton(nodes[keep], renamed[label], edges, rank[part[keep]])

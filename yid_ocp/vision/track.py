@@ -28,7 +28,7 @@ from yid_ocp.vision.calibration import (
     stamp_delay_beyond_clock_offset,
 )
 from yid_ocp.vision.camera_registration import MovingArmSurface, StampedCloud
-from yid_ocp.vision.fit import ShapeFitter
+from yid_ocp.vision.fit import MAX_INFORMATIVE_SURFACE_DISTANCE, ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap, dropped_frame_error
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
@@ -117,7 +117,7 @@ class SingleFrameTracker:
             system, loose = add_free_root_joints(system, values)
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
-        self.shape_fitter = ShapeFitter(system, options.shape_fit, values, loose)
+        self.shape_fitter = ShapeFitter(system, values, loose, options.surface_noise_std)
         self.make_shape_guess_finder = self.shape_fitter.make_shape_guess_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
@@ -162,7 +162,7 @@ class SingleFrameTracker:
     def estimate_shared_values(self) -> SequenceEstimates:
         """Estimate camera calibration, tube dimensions and background, which all frames share, from some frames."""
         calibration = self._calibration()
-        filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
+        filters, noise = self.options.filters, self.options.surface_noise_std
         scene, to_world = self.empty_scene, calibration.camera_state.measured_to_world_points
         clouds = [] if scene is None else [to_world(self._finite(scene, i)[0]) for i in range(len(scene))]
         background = BackgroundPoints.from_point_clouds(clouds, filters.voxel_size, noise)
@@ -186,8 +186,8 @@ class SingleFrameTracker:
             good = (pair for pair in last if not frame_selection.frame_rejection_reason(pair[1], pair[0], self.options))
             shapes = [shape.tube_links_at_configuration(fit.q) for shape, fit in good]
             clouds = [look.sights[0].points for look in looks]
-            near = self.shape_fitter.max_informative_surface_distance
-            found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, near)
+            reach = MAX_INFORMATIVE_SURFACE_DISTANCE
+            found = BackgroundPoints.from_point_clouds(clouds, 2 * filters.voxel_size, noise, shapes, reach)
             points = np.concatenate([found.points, background.points])
             background = BackgroundPoints(points, max(found.match_distance, background.match_distance))
         return SequenceEstimates(calibration, sizes, background)
@@ -352,7 +352,7 @@ class SingleFrameTracker:
             return ()
         corners = np.concatenate([fit.link_ends.reshape(-1, 3) for _, fit in fitted])
         box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
-        seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
+        seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
         return sequence_calibration.foreign_clusters_to_objects(seen, noise, box, self._links, coloured, still)
 
@@ -421,7 +421,7 @@ class SingleFrameTracker:
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
         """Data for the fit of an object whose root position follows from the model: one cloud with its skeleton."""
-        found = point_cloud.extract_skeleton_graph(cloud, rng, self.options.skeleton)
+        found = point_cloud.extract_skeleton_graph(cloud, rng, 2.0 * self._widest)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
@@ -434,7 +434,7 @@ class SingleFrameTracker:
     ) -> _Look:
         """Data for the fit of an object with an unknown root position: a cloud for each assignment of its ends."""
         diameter, options = 2.0 * self._widest, self.options
-        course = cloud_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
+        course = cloud_centerline_tree(cloud, diameter, point_cloud.MAX_EDGE_LENGTH, rng)
         work.skeleton = course.to_skeleton
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):

@@ -210,7 +210,7 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         recording = recording_from_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
         timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
-        depth = surface_meshes.DepthCameraModel(outlier_probability=settings.outlier_fraction)
+        depth = surface_meshes.DepthCameraModel()
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
         made = surface_meshes.render_virtual_frames(_camera_scene(run, system), truth.t, truth.q, camera)
