@@ -265,7 +265,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     row, equations = (re.split(r"\s{2,}", line) for line in table.splitlines() if line.startswith("elbow.damping"))
     assert (row[3:], equations[1:3]) == (["yes", "joints.effort"], ["del[elbow], p1[elbow]", "all"])
     assert float(row[2]) == pytest.approx(float(row[1].split()[0]) * damping["along"], rel=0.02)
-    assert done.out.startswith("Each free parameter changes the readings visibly.")
+    assert done.out.startswith("All free parameters change the readings visibly.")
     result["dependence"]["shoulder.stiffness"]["along"] = 0.1
     assert SUMMARY_BY_RESULT_FORMAT["yid-inspect/1"](result)[0].text.count("hardly determine shoulder.stiffness,")
     # what is not asked for is in the result alone

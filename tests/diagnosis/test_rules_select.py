@@ -13,7 +13,7 @@ from factories import alike, amplitude, cases, effect, fit, loss, score, screeni
 from heard import Heard
 
 from yid_ocp.diagnosis import select
-from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
+from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import HeldOutLoss, chi2_per_sample_decrease_and_std_error, held_out_gap_closure

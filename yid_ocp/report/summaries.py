@@ -438,9 +438,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    yield (
-        f"The library Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
-    )
+    yield f"Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
     noise = dict[Sequence[str], list[str]]()  # names of the recordings by noise of a channel
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps
@@ -499,9 +497,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
     hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    text = (
-        "Each free parameter changes the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
-    )
+    text = "All free parameters change the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
         text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
