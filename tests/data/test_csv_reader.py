@@ -300,6 +300,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         ("t,q_j1,tau_j1,q_d_1,q1_cmd", "t position:j1 effort:j1 position_command:1 position_command:1"),
         ("timestamp,actual_q_0,actual_qd_0,target_q_0", "t position:0 velocity:0 position_command:0"),
         ("time [µs],q_a [°],/ft/wrench/torque/x", "t position:a None"),
+        ("Time (s),Rail Position (m),Rail Force (N),Tip Force (N)", "t position:Rail effort:Rail None"),
         ("t,tip X,tip Y,tip Z", "t x:tip y:tip z:tip"),
         ("t,tip_x [mm],tip_y [mm],tip_z [mm]", "t x:tip y:tip z:tip"),
         ("t,x,y,z", "t x:marker y:marker z:marker"),

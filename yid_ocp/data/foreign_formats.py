@@ -48,6 +48,9 @@ def column_meanings(
         meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
         if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
+        joint = re.sub(r"(?i)[\s_.]+force$", "", name)  # of a rail, beside its position
+        if meaning is None and joint != name and ("position", joint) in meanings:
+            meaning = "effort", joint
         meanings.append(meaning)
         if meaning and unit and not (meaning[0] in sensor_components and unit in ("N", "N m", "rad/s")):
             units["points" if meaning[0] in AXES else meaning[0], unit] = None
