@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.special
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import PartsDoneCounter, grouped
@@ -120,15 +121,16 @@ def simplest_fit_within_one_std_error(
     Returns the first of `fits` (simplest first) whose mean error over the `kinds` of motion is within one standard
     error of the smallest mean error (Hastie, Tibshirani and Friedman 2009, The elements of statistical learning, 7.10,
     doi:10.1007/978-0-387-84858-7). This standard error is the larger of that of the smallest error and that of the
-    difference from it, but at most twice the latter.
+    difference from it. A difference that is significant at the 5 % level (two-sided t-test) counts in any case.
     """
+    least = float(scipy.special.stdtrit(max(len(kinds) - 1, 1), 0.975))
     means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]
     best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
     _, error = mean_and_std_error_over_motion_kinds(best.left_out_errors, kinds)
 
     def is_near(fit: CrossValidatedFrictionLawFit) -> bool:
         difference, paired = prediction_error_difference_and_std_error(fit, best, kinds)
-        return difference <= min(max(error, paired), 2 * paired)
+        return difference <= min(max(error, paired), least * paired)
 
     return next((fit for fit in fits if is_near(fit)), fits[0])
 
