@@ -66,7 +66,7 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
 @pytest.mark.parametrize(
     "more",
     [
-        {"goal": "place", "limits": PlanLimits(max_spring_angle=0.5)},
+        {"goal": "place", "effort_weight": 0.5, "limits": PlanLimits(max_spring_angle=0.5)},
         {"goal": "path", "point_waypoint_offsets_from_start": ((0.0, 0.1, 0.0),)},
         {"goal": "box", "box": BOX},
     ],
@@ -78,7 +78,7 @@ def test_slopes_are_derivatives(moved, wanted, more):
     simple = mover.path.straight_line_coefficients([0.4])
     inside = frames if options.box else None
     rows = PlanResidualAndLimitFunctions(mover, options, frames, np.array(options.target_position), simple, inside)
-    shooting = MotionToTargetSearch(rows, simple.shape)
+    shooting = MotionToTargetSearch([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
     before, after, here = (shooting._residual_and_limit_values(y) for y in (x - e * way, x + e * way, x))
@@ -187,12 +187,33 @@ def test_points_stay_in_the_box(moved, wanted, found):
     assert kept.point_trajectories["tip"][::2, 2].max() <= lid + 1e-4
 
 
+def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
+    quick = plan_motion_to_target(moved, replace(wanted, duration=0.8, hold_duration=0.15, minimize_duration=True))
+    assert quick.is_successful
+    assert quick.max_residual_speed <= wanted.point_rest_speed_tolerance
+    assert quick.simulator.path.duration < 0.71
+
+
 def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
     known = ParameterCovarianceBeforePlan(("elbow.stiffness",), np.array([[0.3**2]]))
     told = plan_motion_to_target(moved, wanted, known=known)
     movers = (elsewhere(told, -1e-4), elsewhere(told, 1e-4))
     below, above = (places(m, m.simulate_path(told.spline_coefficients).state[-1:])[0] for m in movers)
     np.testing.assert_allclose(told.end_position_std, 0.3 * np.abs(above - below) / 2e-4, rtol=1e-4, atol=1e-9)
+
+
+def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_another(moved, wanted):
+    known = ParameterCovarianceBeforePlan(("elbow.stiffness",), np.array([[0.6**2]]))
+    options, worst = replace(wanted, n_spline_coefficients=8, duration=1.0, hold_duration=0.15), []
+    for spread in (False, True):
+        done = plan_motion_to_target(moved, replace(options, minimize_parameter_sensitivity=spread), known=known)
+        assert done.is_successful, done.message
+        errors = []
+        for mover in (elsewhere(done, -0.6), elsewhere(done, 0.6)):
+            state = mover.simulate_path(done.spline_coefficients).state[mover.node_indices_after_motion]
+            errors.append(np.sqrt(np.mean(np.sum((places(mover, state) - options.target_position) ** 2, axis=1))))
+        worst.append(max(errors))
+    assert worst[1] < 0.8 * worst[0]
 
 
 @pytest.mark.parametrize(
@@ -212,6 +233,7 @@ def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
         ({"goal": "box"}, ("plan.goal is box, but plan.box is not set",)),
         ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, (" m outside the box along z", "plan.frames_in_box")),
+        ({"minimize_parameter_sensitivity": True}, ("parameters is not known", "plan.parameter_run_folder")),
         ({"n_spline_coefficients": 1}, ("n_spline_coefficients is 1", "from 2")),
         ({"duration": 0.01}, ("faster than its speed limit", "where: plan.duration\n")),
     ],

@@ -46,9 +46,10 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
         progress.begin_stage("tracking")
         for i in range(101):
             progress.report_parts_done(i, 100, f"frame {i}")
-    tracking = ["tracking ...", *(f"  {10 * i} of 100, frame {10 * i}" for i in range(1, 11))]
-    said = ["solving ...", *(f"  iteration 3, cost 12.5{k}, 1.2 s, first 2 s" for k in ("", *19 * [" (first 12.5)"]))]
-    assert re.sub(r"[\d.]+ s, f", "1.2 s, f", capsys.readouterr().err).splitlines() == said + 2 * tracking
+    tracking = ["tracking ...", *(f"  {5 * i} of 100, frame {5 * i}" for i in range(1, 21))]
+    said = ["solving ...", *(f"  iteration N, cost 12.5{k}, 1.2 s, first 2 s" for k in ("", *19 * [" (first 12.5)"]))]
+    lines = re.sub(r"[\d.]+ s, f", "1.2 s, f", capsys.readouterr().err)
+    assert re.sub(r"iteration \d+", "iteration N", lines).splitlines() == said + 2 * tracking
 
 
 @pytest.mark.parametrize(
@@ -66,14 +67,14 @@ def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
     assert lines == [f"  {done} of 20, case {done}{words}" for done, words in zip((10, 12, 19, 20), told, strict=True)]
 
 
-def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
+def test_slow_parts_have_a_line_each_and_quick_ones_one_in_twenty(capsys, clock):
     progress = command_runner.StderrLogLinesProgress()
     progress.begin_stage("diagnosing")
     for done in range(4):
         clock[0] += 30.0
         progress.report_parts_done(done, 1000, f"case {done}")
     assert len(capsys.readouterr().err.splitlines()) == 5
-    for done in range(4, 99):
+    for done in range(4, 49):
         clock[0] += 0.01
         progress.report_parts_done(done, 1000, f"case {done}")
     assert capsys.readouterr().err == ""
@@ -162,7 +163,7 @@ def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeyp
         progress.report_iterate(ENTRY)
     said = sys.stderr.getvalue()
     assert all(part in said for part in ("\x1b", " left"))
-    assert len(re.findall(r"\[2K  iteration 3, cost 12.5", said)) == (3 if verbose else 0)
+    assert len(re.findall(r"\[2K  iteration \d+, cost 12.5", said)) == (3 if verbose else 0)
     assert all(part in said for part in ("effects", "a9@x"))
     assert "a10@x" not in said
 

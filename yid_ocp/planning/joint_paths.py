@@ -75,8 +75,17 @@ class PlanOptions:
     n_spline_coefficients: Annotated[
         int, Ge(2), Le(40), OptionInfo("coefficients of each joint's spline of degree 5, the final position included")
     ] = 7
+    minimize_duration: Annotated[
+        bool, OptionInfo("whether to search the shortest duration with which the goal is reached")
+    ] = False
     position_tolerance: Annotated[float, Gt(0), OptionInfo("distance that counts as reached", "m")] = 1e-3
     point_rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("point's speed counted as standstill", "m/s")] = 0.01
+    effort_weight: Annotated[
+        float, Ge(0), OptionInfo("weight of the mean square effort over its limit; raise it for calm motions")
+    ] = 0.0
+    minimize_parameter_sensitivity: Annotated[
+        bool, OptionInfo("whether the error due to the parameters' uncertainty is minimised as well")
+    ] = False
     parameters_to_identify: Annotated[
         tuple[str, ...] | None,
         OptionInfo("goal information: parameters to determine most precisely together; default: all free parameters"),

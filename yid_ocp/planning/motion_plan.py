@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -93,16 +95,26 @@ def plan_motion_to_target(
     end = solve_equilibrium_at_point_target(step, values, start, point, place, options)
     check_rest_effort_and_spring_limits(step, values, end, options.limits, "where it ends")
     joints = [system.mechanism.joints[i] for i in mover.moved_joint_indices]
-    travel = end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions
-    least = np.abs(travel) / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
+    travel = np.abs(end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions)
+    least = travel / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
     if options.duration < (shortest := float(least.max())):
-        name, turn = joints[int(least.argmax())].name, abs(travel[int(least.argmax())])
+        name, turn = joints[int(least.argmax())].name, travel[int(least.argmax())]
         what = f"joint {name} would move by {turn:.3g} rad or m in {options.duration:g} s, faster than its speed limit"
         hint = "set a longer plan.duration, or a target nearer to the start"
         raise ConfigError(what, where="plan.duration", allowed=f"at least {shortest:.3g} s", hint=hint)
+
+    def attempt(duration: float) -> TargetMotionPlan:
+        own = replace(mover, path=replace(path, duration=duration))
+        travel = end.state[own.moved_joint_indices] - own.moved_joint_start_positions
+        straight = own.path.straight_line_coefficients(travel)
+        rows = PlanResidualAndLimitFunctions(own, replace(options, duration=duration), point, place, straight, inside)
+        return _attempt(rows, known)
+
     progress.begin_stage(f"searching for a motion that lasts {options.duration:g} s")
-    straight = path.straight_line_coefficients(travel)
-    return _attempt(PlanResidualAndLimitFunctions(mover, options, point, place, straight, inside), known)
+    found = attempt(options.duration)
+    if options.minimize_duration:
+        found = _shortest(found, options, step.time_step, attempt, progress)
+    return found
 
 
 def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
@@ -172,22 +184,23 @@ def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBefo
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):
-        shot = MotionToTargetSearch(rows, guess.shape).solve(guess, lower, upper, options.max_iterations)
+        cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
+        shot = MotionToTargetSearch(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
         half = step_with_time_step(rows.simulator.step, rows.simulator.step.time_step / 2)
-        finer = _with_step(rows.simulator, half)
+        finer = _at_rest(rows.simulator, half, rows.simulator.theta)
         if _steady(rows, finer, shot.w):
             break
         guess, rows = shot.w, replace(rows, simulator=finer)
     return _outcome(rows, replace(shot, n_evaluations=evaluations), known)
 
 
-def _with_step(mover: PathSimulator, step: Step) -> PathSimulator:
-    """The simulator with another step, and the start equilibrium that belongs to it."""
-    start = mover.moved_joint_start_positions, mover.system_start_configuration
-    return replace(mover, step=step, start_equilibrium=solve_start_equilibrium(step, mover.theta, *start))
+def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
+    """The simulator with another step or other parameters, and the start equilibrium that belongs to them."""
+    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.system_start_configuration)
+    return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
 def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array) -> bool:
@@ -199,6 +212,30 @@ def _steady(rows: PlanResidualAndLimitFunctions, finer: PathSimulator, w: Array)
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
     reached, rest = rows.options.position_tolerance, rows.options.point_rest_speed_tolerance
     return bool(np.all(np.array([place / reached, speed / rest]) <= _CONVERGED_TOLERANCE_FRACTION))
+
+
+def _scenarios(
+    rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBeforePlan
+) -> list[PlanResidualAndLimitFunctions]:
+    """Cases with parameters off by one std along the two axes of their covariance that move the final point most."""
+    mover, system = rows.simulator, rows.simulator.step.system
+    if not len(known.parameter_names):
+        what, where = "the uncertainty of the parameters is not known", "plan.minimize_parameter_sensitivity"
+        allowed = "false; or true with the run folder of a `solve` under plan.parameter_run_folder"
+        raise ConfigError(what, where=where, allowed=allowed, hint="set plan.parameter_run_folder, or set this false")
+    values, vectors = np.linalg.eigh(known.covariance)
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))
+    slope = _point_slopes(rows, rows.quasi_static_coefficients, known)
+    moved, found = np.linalg.norm((slope @ axes).reshape(-1, axes.shape[1]), axis=0), []
+    for k in np.argsort(-moved)[:2]:
+        for sign in (-1.0, 1.0):
+            theta = mover.theta.copy()
+            for name, change in zip(known.parameter_names, sign * axes[:, k], strict=True):
+                i, entry = system.parameters.index(name), system.parameters[name]
+                floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
+                theta[i] = np.clip(theta[i] + change, floor, entry.upper)
+            found.append(replace(rows, simulator=_at_rest(mover, mover.step, theta), inside=None))
+    return found
 
 
 def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: ParameterCovarianceBeforePlan) -> Array:
@@ -232,12 +269,44 @@ def _outcome(
         message += ". The simulation failed before the end of the motion"
     if broken:
         message += ". Set a longer plan.duration, a nearer target, or higher plan.limits if the robot allows it"
-    most = TARGET_REACHED_TOLERANCE_FACTOR * rows.options.position_tolerance
+    # the motion with the smallest mean error need not reach the target at the most likely parameters
+    doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
+    most = TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
     far = not error <= most
     if shot.is_converged and far:
         message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its target "
-        message += f"({1e3 * most:.3g} mm, {TARGET_REACHED_TOLERANCE_FACTOR:g} times the tolerance, is tolerated). "
+        message += f"({1e3 * most:.3g} mm, {TARGET_REACHED_TOLERANCE_FACTOR:g} times tolerance or std, is tolerated). "
         message += "Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
     return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
+
+
+def _shortest(
+    found: TargetMotionPlan,
+    options: PlanOptions,
+    h: float,
+    attempt: Callable[[float], TargetMotionPlan],
+    progress: Progress,
+) -> TargetMotionPlan:
+    """The plan with the shortest duration, found by bisection to 0.02 s; `found` itself if that misses the goal."""
+
+    def good(one: TargetMotionPlan) -> bool:
+        return one.is_successful and one.max_residual_speed <= options.point_rest_speed_tolerance
+
+    if not good(found):
+        return found
+    low, high = 0, round(options.duration / h)
+    finest = max(1, round(0.02 / h))
+    progress.begin_stage("searching for the shortest motion")
+    for done in itertools.count():
+        if high - low <= finest:
+            break
+        middle, left = (low + high) // 2, math.ceil(math.log2((high - low) / finest))
+        progress.report_parts_done(done, done + left, f"a motion that lasts {middle * h:g} s")
+        tried = attempt(middle * h)
+        if good(tried):
+            found, high = tried, middle
+        else:
+            low = middle
+    return found

@@ -84,6 +84,7 @@ class PlanResidualAndLimitFunctions:
         mover, options, h = self.simulator, self.options, self.simulator.step.time_step
         n, size = mover.step.system.n_coordinates, w.size
         assert rollout.state_sensitivity is not None
+        assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
         by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
         end, course = mover.node_indices_after_motion, self.desired_point_trajectory
@@ -96,6 +97,11 @@ class PlanResidualAndLimitFunctions:
         bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
         parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
+        if options.effort_weight:
+            finite = np.isfinite(self._effort_limit)
+            unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
+            by_effort = rollout.effort_sensitivity[:, finite, -size:] / unit[:, None]
+            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
         return parts
 
     def constraints_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
@@ -192,22 +198,23 @@ class MotionToTargetResult:
 
 
 class MotionToTargetSearch:
-    """A search for the motion that reaches a target best within the limits."""
+    """A search for the motion that reaches a target best in all `cases` of parameters. Limits hold for the first."""
 
-    def __init__(self, functions: PlanResidualAndLimitFunctions, shape: tuple[int, int]) -> None:
-        self._functions, self._shape = functions, shape
+    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
+        self._cases, self._shape = list(cases), shape
         self._residual_and_limit_values = memoize_last_call(self._evaluated)
-        self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(functions.limit_rows)
+        self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 
     def _evaluated(self, x: Array) -> tuple[Array, Array, Array, Array]:
         """Residual, scaled limit values and the Jacobians of both; not finite if a rollout fails."""
         self.evaluations += 1
         w = x.reshape(self._shape)
-        rollout = self._functions.simulator.simulate_path(w, True)
-        parts = self._functions._goal_residual(rollout, w)
-        value, slope = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-        limited, by_w = self._functions.constraints_and_jacobian(rollout, w)
+        rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
+        pairs = zip(self._cases, rollouts, strict=True)
+        parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
+        value, slope = (np.concatenate(rows) / np.sqrt(len(self._cases)) for rows in zip(*parts, strict=True))
+        limited, by_w = self._cases[0].constraints_and_jacobian(rollouts[0], w)
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
