@@ -52,6 +52,8 @@ CRITERIA = {
     "mean log ratio of blocks": (select, "_distance_in_prediction", "float(ratios.mean())", "-math.inf"),
     "at most sqrt(2N)": (select, "_near_best_models", "math.sqrt(2 * samples)", "math.inf"),
     "implausible models": (select, "_near_best_models", "excess_chi2_per_sample <= most", "chi2_per_sample < -1"),
+    "fewest parameters first": (select, "_near_best_models", "(fit.total_effect_parameter_count, ", "(0.0, "),
+    "plausible second effects": (select, "_plausible_beside", "fit.implausible_parameters(effect, limits)", "False"),
     "significant effects": (select, "_is_needed", "is_clear and all(", "is_clear or not all("),
     "two thirds of a small gap": (verdict, "_explained_fraction", "min(least, limits", "min(math.inf, limits"),
     "small gaps": (verdict, "_explained_fraction", "1.0 if fits_to_noise and", "1.0 if False and"),

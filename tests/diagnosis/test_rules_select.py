@@ -13,7 +13,7 @@ from factories import alike, amplitude, cases, effect, fit, loss, score, screeni
 from heard import Heard
 
 from yid_ocp.diagnosis import select
-from yid_ocp.diagnosis.refit import RefitContext
+from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import HeldOutLoss, chi2_per_sample_decrease_and_std_error, held_out_gap_closure
@@ -109,13 +109,13 @@ def nearest(fits, limits=LIMITS, nominal=None):
 @cases(
     "small, large, expected",
     {
-        "within its error": ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["large@x", "small@x"]),
+        "within its error": ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["small@x", "large@x"]),
         "sure": ((1.2, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
         "all recordings together": ((1.01, 1.01), (1.0, 1.0), ["small@x", "large@x"]),
         "not predicted": ((math.inf, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
     },
 )
-def test_what_is_within_reach_of_the_best_stays_beside_it(small, large, expected):
+def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
     fits = [replace(there(of, *own), residual_count=100) for of, own in ((LARGE, large), (SMALL, small))]
     assert nearest(fits) == expected
     assert nearest(fits[::-1]) == expected
@@ -367,6 +367,14 @@ def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
     assert Rounds(monkeypatch, GROWING, p_values=(0.02, 0.03, 0.04)).compose() == ([], [], ())
 
 
+def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING)
+    monkeypatch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
+    assert rounds.compose()[1] == ["a", "c"]
+    # the first one may be larger, and what is in the place of one that is may be too
+    assert Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)}).compose()[1] == ["b"]
+
+
 def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
     _, chosen, found = Rounds(monkeypatch, GROWING).compose(max_effects=1)
     assert (chosen, found[0].model_error_std) == (["a"], {"a@x.a": 0.0})
@@ -385,6 +393,8 @@ def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it
 
     assert unsure() == {"a@x.a": pytest.approx(math.sqrt(0.125))}
     assert unsure(a=(1.0, 1.0)) == {}, "what leaves only noise"
+    monkeypatch.setattr(RefitStatistics, "implausible_parameters", lambda _, of, limits: ["a"] * (of.kind == "b"))
+    assert unsure() == {"a@x.a": pytest.approx(0.4)}
 
 
 LITTLE = {"": (1.6, 1.8), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
@@ -460,7 +470,7 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     rough = replace(spring, held_out_loss=loss(1.2, 1.2))
     assert nearest([rough, replace(offset, held_out_loss=loss(1.21, 1.21))]) == ["spring@elbow"]
     found = nearest([replace(rough, cost=1e3), replace(offset, held_out_loss=loss(1.2, 1.2))])
-    assert found == ["spring@elbow", "offset@elbow"]
+    assert found == ["offset@elbow", "spring@elbow"]
 
 
 EACH_LEFT_OUT = [("b@x and c@x without b@x", ["c"], 2.0), (["c"], ["a"], 1.0)]

@@ -78,7 +78,7 @@ def _near_best_models(
     """Models that the recordings cannot distinguish from the best one, with their distance from it, 0 to 1.
 
     If the best one leaves only noise, the distance is a log odds in units of what decides. Otherwise it is the held-out
-    error in standard errors; implausible ones count only if no plausible one explains enough.
+    error in standard errors, the simplest first; implausible ones count only if no plausible one explains enough.
     """
     best = min(fits, key=_chi2, default=nominal)
     if _leaves_noise(best, limits):
@@ -96,7 +96,7 @@ def _near_best_models(
         best_plausible = min(plausible, key=_chi2, default=nominal)
         if best_plausible.held_out_loss.excess_chi2_per_sample <= most:
             best, fits = best_plausible, plausible
-        ranked = sorted(fits, key=_chi2)
+        ranked = sorted(fits, key=lambda fit: (fit.total_effect_parameter_count, _chi2(fit)))
         distances = [_distance_in_prediction(fit, best) for fit in ranked]
     return [(fit, distance) for fit, distance in zip(ranked, distances, strict=True) if distance <= 1]
 
@@ -138,6 +138,13 @@ def _beside(effects: Sequence[EffectBase], fit: RefitStatistics) -> list[EffectB
     """The effects of a fit that are not among some effects."""
     known = {effect.label for effect in effects}
     return [effect for effect in fit.effects if effect.label not in known]
+
+
+def _plausible_beside(
+    base: Sequence[EffectBase], fits: Sequence[RefitStatistics], limits: Thresholds
+) -> list[RefitStatistics]:
+    """Fits whose effects beside `base` are plausible; others would correct errors of the effects in `base`."""
+    return [fit for fit in fits if not any(fit.implausible_parameters(effect, limits) for effect in _beside(base, fit))]
 
 
 def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[EffectsWithStart]:
@@ -195,7 +202,7 @@ def select_effects(
             pairs = _pairs_to_refit(search, screened, base[0])
             fits += refit_with_each_effect(search, (), pairs, nominal.values, "together")
         later += [fit.statistics() for fit in fits]
-        near = _near_best_models(nominal, fits, limits)
+        near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before, rivals)
     if len(chosen.effects) == 1:
         best = chosen.effects[0].label
@@ -261,7 +268,7 @@ def _revised(
     tried = [start for start in best if start[0][0].label != label]
     own = replace(full, effects=(*rest, effect))
     others = refit_with_each_effect(search, rest, tried, without.values, company)
-    near = _near_best_models(nominal, [own, *others], limits)
+    near = _near_best_models(nominal, [own, *_plausible_beside(rest, others, limits)], limits)
     better = next((fit for fit, _ in near if _is_needed(without, fit, limits)), own)
     rivals[better.effects[-1].label] = [(fit.effects[-1], distance) for fit, distance in near]
     if better is own:
@@ -284,7 +291,7 @@ def _equivalents_and_shares(
 
 
 def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:
-    """Root mean square change of each effect parameter of a fit by one effect more; empty if none can act.
+    """Root mean square change of each effect parameter of a fit by one plausible effect more; empty if none can act.
 
     Any further effect may have a part in the gap that the fit leaves. A fit that leaves only noise has no gap.
     """
@@ -292,6 +299,7 @@ def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], lim
         return {}
     # one effect more, and no other one less
     more = [o for o in later if len(_beside(fit.effects, o)) == 1 == len(o.effects) - len(fit.effects)]
+    more = _plausible_beside(fit.effects, more, limits)
     names, count = [name for effect in fit.effects for name in effect.parameters.names], max(len(more), 1)
     moved = {name: [other.values[name] - fit.values[name] for other in more] for name in names}
     return {name: math.hypot(*changes) / math.sqrt(count) for name, changes in moved.items()}
