@@ -24,7 +24,6 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.registry import Registry
 
 PositiveFloat = Annotated[float, annotated_types.Gt(0)]
-UnitIntervalFloat = Annotated[float, annotated_types.Ge(0), annotated_types.Le(1)]
 _BOUND_MARKERS = (
     (annotated_types.Gt, "gt", operator.gt, "above"),
     (annotated_types.Ge, "ge", operator.ge, "from"),

@@ -162,7 +162,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
         "kind": "ConfigError",
         "what": "there is no key 'iteration'",
         "where": "--set solver.iteration",
-        "allowed": "name, max_iterations, step_tolerance, cost_tolerance, initial_damping",
+        "allowed": "name, max_iterations, step_tolerance, cost_tolerance",
         "hint": "did you mean 'max_iterations'? CHANGELOG.md of the project has the new names of older ones",
         "exit_code": 2,
     }

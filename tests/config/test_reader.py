@@ -116,7 +116,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("solver: {time_step: 1}", ["there is no key 'time_step' in solver", "'time_step' is a key of `problem`"]),
         ("solver: {held_out: []}", ["'held_out' is a key of `recordings`"]),
         ("solver: {parameters: {}}", ["'parameters' is a key of the file itself"]),
-        ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
+        ("solver: {name: gauss_newton, nonmonotone_memory: 3}", ["there is no key 'nonmonotone_memory'"]),
         ("xyzzy: 3", ["leave 'xyzzy' out", RENAMED]),
         ("solver: {name: lifted}", ["there is no solver 'lifted'", RENAMED]),
         ("diagnosis: {refits: 3}", ["there is no key 'refits'", RENAMED]),
@@ -139,8 +139,8 @@ def test_refusals(refused_with, written, text, words):
 
 
 def test_the_solver_and_compared_methods(written):
-    run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
-    assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
+    run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, nonmonotone_memory: 3}\n"))
+    assert run.solver == SteepestDescent(max_iterations=7, nonmonotone_memory=3)
     run = load_config(written(METHODS.replace("VALUE", "max_iterations: 7")))
     assert list(run.compare.methods) == ["gauss_newton", "multiple_shooting"]
     chosen = run.compare.methods["multiple_shooting"]

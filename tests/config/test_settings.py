@@ -81,7 +81,7 @@ def test_the_schema_accepts_every_configuration(repository, rules):
         ({"solver": {"max_iterations": -3}}, False),
         ({"solver": {"name": "multiple_shooting", "first_trial_step_rule": "last"}}, False),
         ({"compare": {"methods": {"newton": {}}}}, False),
-        ({"solver": {"name": "steepest_descent", "backtracking_factor": 0.3}}, True),
+        ({"solver": {"name": "steepest_descent", "nonmonotone_memory": 3}}, True),
         ({"compare": {"methods": {"gauss_newton": {"max_iterations": 3}, "multiple_shooting": {}}}}, True),
         ({"model": {"object": None}}, True),
     ],

@@ -93,8 +93,7 @@ def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
     t, held = clamps
     options = CableOptions(
-        default_branch=CableBranchRigidityDampingAndDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4),
-        has_edge_lengths_per_recording=False,
+        default_branch=CableBranchRigidityDampingAndDensity(bend_rigidity=1e-3, twist_rigidity=2e-3, bend_damping=1e-4)
     )
     stub = as_recording(cable, t, held)
     lengths = typical_point_pair_distances(cable.edge_vertex_names, [as_recording(cable, t, {})])

@@ -490,9 +490,10 @@ def test_a_rejected_step_is_followed_by_one_that_is_shorter_along_what_is_weakly
     assert [has_slopes for _, has_slopes, _ in problem.asked[1:4]] == [True, False, True]
 
 
-def test_the_step_after_a_rejected_one_is_as_long_as_that_suggests_whatever_the_damping():
+def test_the_step_after_a_rejected_one_is_as_long_as_that_suggests_whatever_the_damping(monkeypatch):
     problem = edge(1.2, weak=0.1)
-    GaussNewton(initial_damping=1e-12).minimize_cost(problem, np.array([1.0, 0.0]), None)
+    monkeypatch.setattr("yid_ocp.solvers.gradient_methods._INITIAL_DAMPING", 1e-12)
+    GaussNewton().minimize_cost(problem, np.array([1.0, 0.0]), None)
     assert 0.05 < problem.asked[2][0][0] - 1.0 <= 0.25
 
 

@@ -187,13 +187,6 @@ def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(built):
     assert [finer[name].value for name in ("T1.bend", "T2.bend", "T1.damping")] == [20, 6, 0.04]
 
 
-def test_link_lengths_as_parameters(built):
-    assert "a.length" in built(SEGMENTED).parameters.names
-    names = built(SEGMENTED.replace("links: 2}", "links: 2, has_length_parameter_per_link: true}")).parameters.names
-    assert {"a.length_0", "a.length_1", "b.length"} <= set(names)
-    assert "a.length" not in names
-
-
 BY_JOINT = "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: foam_y}}\n"
 BY_JOINT += "  damping: {{hinge: 0.2{more}}}\n"
 

@@ -376,7 +376,6 @@ class _TrackSettings:
     virtual_frames: Annotated[_VirtualFramesSettings, OptionInfo("virtual frames, used without recorded frames")] = (
         _VirtualFramesSettings()
     )
-    write_virtual_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
     n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("number of frames with drawings of every stage")] = 2
     options: Annotated[TrackOptions, OptionInfo("filters, clock, calibration and acceptance of frames")] = field(
         default_factory=TrackOptions

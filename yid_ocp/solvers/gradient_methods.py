@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import scipy.optimize
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import (
@@ -27,7 +27,9 @@ from yid_ocp.solvers import base
 
 # A positive unknown decreases by at most this factor in a step, until it reaches this fraction of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
+_INITIAL_DAMPING = 1e-6  # initial mu, in units of the largest diagonal entry of the scaled normal matrix
 _ARMIJO_CONSTANT = 1e-4  # fraction of the predicted decrease of the cost that a step must reach
+_BACKTRACKING_FACTOR = 0.5  # on a rejected step of the steepest descent
 _LENGTH_AFTER_FAILURE = 0.25  # of the next step, over that of a rejected one whose trial had no prediction
 # The search ends after this many steps (5 if coarse) that together lower the cost by at most this [units of noise] and
 # move no unknown by more than this [std], if the predicted decrease is at most the cost of a 95 % interval.
@@ -57,9 +59,6 @@ class GaussNewton(base.SolverWithCheckedSettings):
     cost_tolerance: Annotated[
         float, Gt(0), OptionInfo("converged if the predicted relative decrease of the cost is below this")
     ] = 1e-8
-    initial_damping: Annotated[
-        float, Gt(0), OptionInfo("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
-    ] = 1e-6
     name: ClassVar[str] = "gauss_newton"
     uses_process_noise_covariance: ClassVar[bool] = True
 
@@ -89,7 +88,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
             made = recorder.solver_result_with_iterates(status, message, x, now.equilibrium_guesses)
             return replace(made, evaluation=now)
 
-        mu, rejected, longest = self.initial_damping, False, np.inf
+        mu, rejected, longest = _INITIAL_DAMPING, False, np.inf
         while True:
             jacobian, residual = now.jacobian, now.residual
             assert jacobian is not None
@@ -231,9 +230,9 @@ class SteepestDescent(base.SolverWithCheckedSettings):
     """The steepest descent method with Armijo backtracking: x <- P(x - s g), where P projects onto the bounds.
 
     The gradient g comes from the adjoint method and is not scaled, as in the paper (Caldwell et al. 2014). The first
-    trial step s of an iteration is the last accepted step divided by `backtracking_factor` (`last`, as in the paper),
-    or the Barzilai-Borwein step (`spectral`). The spectral step needs far fewer iterations if the cost may rise in a
-    few of them: with `nonmonotone_memory: 10`, a step must only lower the largest of the last 10 costs.
+    trial step s of an iteration is twice the last accepted step (`last`, as in the paper), or the Barzilai-Borwein step
+    (`spectral`). The spectral step needs far fewer iterations if the cost may rise in a few of them: with
+    `nonmonotone_memory: 10`, a step must only lower the largest of the last 10 costs.
 
     References
     ----------
@@ -248,7 +247,6 @@ class SteepestDescent(base.SolverWithCheckedSettings):
         Gt(0),
         OptionInfo("converged if the projected gradient times the unknowns' size is below this fraction of the cost"),
     ] = 1e-5
-    backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("factor on a rejected step")] = 0.5
     first_trial_step_rule: Annotated[
         Literal["last", "spectral"], OptionInfo("first trial step length of an iteration; last: Caldwell et al. (2014)")
     ] = "last"
@@ -286,12 +284,12 @@ class SteepestDescent(base.SolverWithCheckedSettings):
                 recorder.n_evaluations += 1
                 if attempt.ok and attempt.cost <= reference - _ARMIJO_CONSTANT * float(gradient @ (x - trial)):
                     break
-                length *= self.backtracking_factor
+                length *= _BACKTRACKING_FACTOR
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
                     return ended(base.Status.STALLED, "no step along the gradient lowers the cost. Use gauss_newton")
             moved, before, x = trial - x, gradient, trial
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
-            length /= self.backtracking_factor
+            length /= _BACKTRACKING_FACTOR
             turned = gradient - before
             if self.first_trial_step_rule == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)

@@ -210,9 +210,8 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         recording = recording_from_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
         timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
-        depth = surface_meshes.DepthCameraModel()
         pose = look_at_pose(settings.camera_position, settings.camera_target)
-        camera = surface_meshes.VirtualCameraSetup(pose, depth, timing, seed=seed)
+        camera = surface_meshes.VirtualCameraSetup(pose, timing=timing, seed=seed)
         made = surface_meshes.render_virtual_frames(_camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
@@ -321,10 +320,8 @@ def _frame_tasks(
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
         write_frame_folder(made.sequence, frames)
         write_recording(recording, joints)
-        if said.write_virtual_frames:
-            shutil.copytree(frames, folder.path / "frames")
     recordings = RecordingsSettings(estimate=() if joints is None else (str(joints),))
-    track = replace(said, frames_path=str(frames), n_drawn_frames=0, write_virtual_frames=False)
+    track = replace(said, frames_path=str(frames), n_drawn_frames=0)
     own = replace(run, track=track, recordings=recordings, output=OutputSettings(), name="", description="")
     sources = {"frames": frames, "joints": joints, "background": said.background_frames_path}
     with add_setting_location_to_errors(run, "track", "frames_path"):

@@ -77,9 +77,6 @@ class CableOptions:
         Literal["axis", "weld"],
         OptionInfo("axis: the roll at the end clamp is free; weld: it is held at the parameter clamp_end.roll"),
     ] = "axis"
-    has_edge_lengths_per_recording: Annotated[
-        bool, OptionInfo("whether every recording has its own distances of neighbouring points, as length parameters")
-    ] = True
     shape_memory_fraction: Annotated[
         float | None,
         Ge(0),
@@ -241,7 +238,7 @@ def _segments(
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.has_separate_twist_damping else None,
             values_given_as_rigidities=True,
-            has_length_parameter_per_link=options.has_edge_lengths_per_recording,
+            has_length_parameter_per_link=True,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
         segments.append(replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before))
@@ -279,6 +276,4 @@ class _ClampedCable(CableOptions, ObjectBuilder):
         return clamped_cable_system(edge_lengths, self.clamped_cable_vertices(), replace(self, gravity=gravity))
 
     def edge_length_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        if not self.has_edge_lengths_per_recording:
-            return {}
         return length_parameters_from_edges(self.clamped_cable_vertices(), edge_lengths)

@@ -48,7 +48,6 @@ class _SegmentGeometry:
     values_given_as_rigidities: Annotated[bool, OptionInfo("whether stiffness and damping are rigidities")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether its first end is clamped by a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("rotation axes, base to tip; others are rigid (no z: no twist)")] = "xyz"
-    has_length_parameter_per_link: Annotated[bool, OptionInfo("whether each link has its own length parameter")] = False
 
     def _build_segment(self, name: str, damping: float, link_division: int) -> FlexibleSegment:
         """Build the segment `name`. Each link is divided into `link_division` links. The segment's stiffness stays."""
@@ -64,7 +63,7 @@ class _SegmentGeometry:
         return FlexibleSegment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
-            **attributes_to_dict(self, f"{same} has_length_parameter_per_link"),
+            **attributes_to_dict(self, same),
             links=self.links * n,
             link_lengths=None if lengths is None else [length / n for length in lengths for _ in range(n)],
             parent_link_index=None if index is None else (index + 1) * n - 1,  # a child stays where it is on its parent
