@@ -385,9 +385,8 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
         if group == "joints.effort":
             if proposal.torque_bias_std and not proposal.is_identified_from_efforts_only:
                 entries.append(f"bias_std: {_number_or_numbers_by_name(proposal.torque_bias_std)}")
-                said += ". bias_std is the expected constant error of a torque (a guess, 1 % of its limit)"
-            elif noise.std is not None and not proposal.is_identified_from_efforts_only:
-                said += ". The robot file has no effort limits, so set bias_std yourself if torques have offsets"
+                said += ". bias_std is the expected constant error of a torque (a guess: 1 % of its limit in the robot "
+                said += "file, else 5 % of the largest recorded one)"
             if told_by_points:
                 said = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
         is_mounted = places and "." in group
