@@ -12,7 +12,13 @@ from yid_ocp.data.channel_checks import Issue
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import fit_problem
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import _is_modelled, _once, build_problem, data_quality_issues_of_recording
+from yid_ocp.workflow.build_problem import (
+    _is_modelled,
+    _once,
+    _without_repeated_warnings,
+    build_problem,
+    data_quality_issues_of_recording,
+)
 
 
 @pytest.fixture
@@ -161,3 +167,13 @@ def test_a_delay_and_a_lag_both_answer_late_efforts(repository, effect):
     late = Issue("effort_lag", "efforts are late", "not_trusted", 3.0, "shift their times", "", "joints", "effort")
     for overrides, answered in (((), False), ((f"model.effects=[{{kind: {effect}}}]",), True)):
         assert _is_modelled(build_system(load_config(file, overrides)), late) is answered
+
+
+def test_what_is_certain_of_a_group_is_not_said_again_as_a_warning() -> None:
+    def issue(severity: str, cause: str = "clock_offset", group: str = "points") -> Issue:
+        return Issue(cause, "late", severity, 1.0, "shift them", "one", group)
+
+    other, elsewhere = issue("warning", "clock_drift"), issue("warning", group="markers")
+    certain = issue("not_trusted")
+    assert _without_repeated_warnings([issue("warning"), certain, other, elsewhere]) == [certain, other, elsewhere]
+    assert _without_repeated_warnings([issue("warning")]) == [issue("warning")]

@@ -152,7 +152,8 @@ def _changed_times(
     # a search over so many times always finds some improvement
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"if {-late:+.3g} s are added to their times"
-        yield _Change("clock_offset", words, f"add {-late:+.3g} s to their times", error)
+        again = f"import again with --clock-offset FILE={-late:.3g}"
+        yield _Change("clock_offset", words, f"add {-late:+.3g} s to their times ({again})", error)
         return
     late, drift, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:

@@ -249,6 +249,7 @@ def _check_recordings(
             role += parts.recordings
     if arm is not None:
         issues += _excitation(run, arm, free, kept[0])
+    issues = _without_repeated_warnings(issues)
     _raise_for_issues(run, issues)
     if not kept[0]:
         gaps = dict.fromkeys(own.what.partition(";")[0] for own in issues if own.cause in ("gap", "clock_jump"))
@@ -257,6 +258,12 @@ def _check_recordings(
         allowed = f"0.5 s without a gap{where}"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(issues)
+
+
+def _without_repeated_warnings(issues: Sequence[Issue]) -> list[Issue]:
+    """The issues without warnings about groups that certainly have the same issue."""
+    certain = {(own.cause, own.recording, own.group) for own in issues if own.severity == "not_trusted"}
+    return [o for o in issues if o.severity != "warning" or (o.cause, o.recording, o.group) not in certain]
 
 
 def data_quality_issues_of_recording(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
