@@ -188,13 +188,9 @@ def stds_with_discretisation_and_encoder_errors(
     in a model with the `effects` of the fit, is added if `solve` does so too. Of data that are corrected for it, a part
     is left. Also returns which refinements were made.
     """
-    has_links = "links" in coarse.options.checked_discretisations and _has_divisible_links(coarse)
-    refinements: dict[RefinementKind, Callable[[], _FinerModel]] = {
-        "time_step": lambda: _FinerModel(fine),
-        "links": lambda: _refined_problem(coarse, "links", effects=effects),
-    }
-    if not has_links:
-        del refinements["links"]
+    refinements: dict[RefinementKind, Callable[[], _FinerModel]] = {"time_step": lambda: _FinerModel(fine)}
+    if "links" in coarse.options.checked_discretisations and _has_divisible_links(coarse):
+        refinements["links"] = lambda: _refined_problem(coarse, "links", effects=effects)
     shifts, counted = [_shifts_by_more_encoder_noise(coarse, x, at_x)], list[RefinementKind]()
     for kind, refined in refinements.items():
         with contextlib.suppress(YidError):
@@ -202,8 +198,8 @@ def stds_with_discretisation_and_encoder_errors(
             finer = replace(finer, problem=problem_with_data_of(finer.problem, coarse))  # corrected ones
             made = _gauss_newton_step_in_finer_model(finer, coarse, x, at_x)
             if not isinstance(made, str):
-                part = _LEFT_AFTER_CORRECTION if kind == "links" and is_corrected_for_links else 1.0
-                shifts.append({name: part * move for name, move in made[0].items()})
+                left = _LEFT_AFTER_CORRECTION if kind == "links" and is_corrected_for_links else 1.0
+                shifts.append({name: left * move for name, move in made[0].items()})
                 counted.append(kind)
     own = {name: _std_with_shifts(std, [part[name] for part in shifts if name in part]) for name, std in stds.items()}
     return own, tuple(counted)

@@ -133,7 +133,7 @@ def add_discretisation_errors(
 def uncounted_error_texts(problem: EstimationProblem, counted: Collection[str]) -> tuple[str, ...]:
     """Return the errors of the discretisation that standard deviations leave out. `counted` has the counted ones.
 
-    The error of links is not named where links can be divided, but are not by `checked_discretisations`.
+    Links that can be divided, but are not refined by `checked_discretisations`, are not named.
     """
     can_divide, chosen = bool(problem.options.divided_links_model), problem.options.checked_discretisations
     without = {"links"} if not problem.system.segment_layouts or (can_divide and "links" not in chosen) else set()

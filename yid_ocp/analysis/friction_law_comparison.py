@@ -123,14 +123,14 @@ def simplest_fit_within_one_std_error(
     doi:10.1007/978-0-387-84858-7). This standard error is the larger of that of the smallest error and that of the
     difference from it. A difference that is significant at the 5 % level (two-sided t-test) counts in any case.
     """
-    least = float(scipy.special.stdtrit(max(len(kinds) - 1, 1), 0.975))
+    quantile = float(scipy.special.stdtrit(len(kinds) - 1, 0.975))
     means = [mean_and_std_error_over_motion_kinds(fit.left_out_errors, kinds)[0] for fit in fits]
     best = fits[int(np.argmin(np.where(np.isfinite(means), means, np.inf)))]
     _, error = mean_and_std_error_over_motion_kinds(best.left_out_errors, kinds)
 
     def is_near(fit: CrossValidatedFrictionLawFit) -> bool:
         difference, paired = prediction_error_difference_and_std_error(fit, best, kinds)
-        return difference <= min(max(error, paired), least * paired)
+        return difference <= min(max(error, paired), quantile * paired)
 
     return next((fit for fit in fits if is_near(fit)), fits[0])
 

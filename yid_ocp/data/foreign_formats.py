@@ -45,12 +45,9 @@ def column_meanings(
     whole = {name.strip().lower() for name, _ in split}
     meanings, units = list[ColumnMeaning](), dict[tuple[str, str], None]()
     for name, unit in split:
-        meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name)
+        meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name) or _joint_force(name, meanings)
         if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
-        joint = re.sub(r"(?i)[\s_.]+force$", "", name)  # of a rail, beside its position
-        if meaning is None and joint != name and ("position", joint) in meanings:
-            meaning = "effort", joint
         meanings.append(meaning)
         if meaning and unit and not (meaning[0] in sensor_components and unit in ("N", "N m", "rad/s")):
             units["points" if meaning[0] in AXES else meaning[0], unit] = None
@@ -106,6 +103,12 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
         if found := re.fullmatch(rf"{word}_?(\d+)|{word}_(.+)|(?:q_?(?=\d+_))?(.+)_{end}", plain, case):
             return channel, found[1] or found[2] or found[3]
     return None
+
+
+def _joint_force(column: str, known: Sequence[ColumnMeaning]) -> ColumnMeaning:
+    """Effort of a joint, such as a rail, in a column named after its force, if its position is among `known`."""
+    found = re.fullmatch(r"(.*?)[\s_.]+force", column, re.IGNORECASE)
+    return ("effort", found[1]) if found and ("position", found[1]) in known else None
 
 
 _Rows = Iterable[tuple[int, list[str]]]

@@ -92,7 +92,9 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("parameter", *heads, "meaning")]
     for name, entry in free.items():
         verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
-        std = "infinite" * (verdict == "weak") if entry["std"] is None else f"{entry['std']:.2g}"
+        std = "infinite" if verdict == "weak" else ""
+        if entry["std"] is not None:
+            std = f"{entry['std']:.2g}"
         std *= verdict not in ("", "at_bound") and entry["value"] not in (entry["lower"], entry["upper"])
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         own = ("–" if verdict == "not_identifiable" else value, std, interval, shown_unit(entry["unit"]))

@@ -457,7 +457,8 @@ class _Path:
             return CubicSpline(t, gaussian_filter1d(values, smoothed, axis=0) if smoothed else values)
 
         self.joints, self._start, self._last = joints, position[:_START].mean(axis=0), float(t[-1])
-        self._values = [spline(position), spline(position).derivative(1), spline(position).derivative(2)]
+        path = spline(position)
+        self._values = [path, path.derivative(1), path.derivative(2)]
         one = np.eye(1, len(t), len(t) // 2)[0]
         # std of the second derivative if white noise of std 1 is in the angles [1/s^2]
         self.acceleration_per_noise = float(np.linalg.norm(spline(one).derivative(2)(t)))
@@ -512,24 +513,28 @@ def _followed(
     inertia = np.zeros((model.nv, model.nv))
     for column, unit in zip(inertia, np.eye(model.nv), strict=True):
         scene.mujoco.mj_mulM(model, data, column, unit)
-    std = np.broadcast_to(0.0 if joints.position_std is None else joints.position_std, len(joints.names))[columns]
-    noise = np.sqrt(inertia[np.ix_(at, at)] ** 2 @ (path.acceleration_per_noise * std) ** 2)
-    if not model.nu:
-        played = _played(scene, t[-1], lambda k, now: controller.apply_and_return_control_input(now))
-        return replace(played, value_std=noise)
-    assert joints.effort is not None
-    effort = joints.effort[:, columns]
-    if model.na:  # lagging torques start at the first recorded value
-        data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
-    _initialize_actuator_history(scene, effort[0])
+    acceleration_std = path.acceleration_per_noise * _stds_of_columns(joints.position_std, joints, columns)
+    value_std = np.sqrt(inertia[np.ix_(at, at)] ** 2 @ acceleration_std**2)
+    effort = joints.effort[:, columns] if model.nu and joints.effort is not None else None
+    if effort is not None:
+        if model.na:  # lagging torques start at the first recorded value
+            data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
+        _initialize_actuator_history(scene, effort[0])
 
     def control(k: int, now: float) -> Array:
+        if effort is None:
+            return controller.apply_and_return_control_input(now)
         data.ctrl[:] = effort[np.searchsorted(t, now + 1e-9, side="right") - 1]
         missing = controller.apply_and_return_control_input(now) - data.qfrc_actuator[at]
         data.qfrc_applied[at] = missing
         return np.asarray(data.ctrl + missing)
 
-    return replace(_played(scene, t[-1], control), value_std=noise)
+    return replace(_played(scene, t[-1], control), value_std=value_std)
+
+
+def _stds_of_columns(std: float | Array | None, joints: JointGroup, columns: list[int]) -> Array:
+    """Standard deviations of some joints, zero if they are not recorded."""
+    return np.broadcast_to(0.0 if std is None else std, len(joints.names))[columns]
 
 
 def _commanded(scene: MujocoModelAndState, system: System, t: Array, commands: Array) -> _Played:
@@ -560,9 +565,9 @@ def _errors(
     said, *stds = (getattr(joints, name.removeprefix("joints.") + part, None) for part in ("", "_std", "_bias_std"))
     if said is not None and inside.any():
         error = float(np.sqrt(np.mean((_at(t[inside], played.t, played.values) - said[inside][:, columns]) ** 2)))
-        known = [np.broadcast_to(std, len(joints.names))[columns] for std in stds if std is not None]
-        variance = np.mean(sum((level**2 for level in known), played.value_std**2))
-        found[name] = ReplayErrorAgainstRecording(error, float(np.sqrt(variance)), unit)
+        variances = [_stds_of_columns(std, joints, columns) ** 2 for std in stds]
+        noise_rms = float(np.sqrt(np.mean(np.sum(variances, axis=0) + played.value_std**2)))
+        found[name] = ReplayErrorAgainstRecording(error, noise_rms, unit)
     for group in recording.points:
         t = group.t - joints.t[0]
         for i, point in enumerate(group.names):

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from scipy.ndimage import maximum_filter1d
-from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period, noise_or_quantization_std
@@ -18,6 +17,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChan
 from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.urdf import joint_damping_and_friction, read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
@@ -451,7 +451,7 @@ def _in_frame(poses: Array, positions: Array) -> Array:
 
 
 def _mount_direction(axis: str) -> Array:
-    return np.asarray(Rotation.from_euler("xyz", _MOUNT_ROTATIONS[axis]).as_matrix()[:, 2])
+    return rotation_from_rpy(*_MOUNT_ROTATIONS[axis])[:, 2]
 
 
 def _holder_axis(tree: Mechanism, recording: Recording, length: float, holder: str) -> str:

@@ -54,10 +54,11 @@ def run_plan(
         else:
             if run.model.arms.mode == "servo":  # prescribed arms have no parameters of servos
                 run = replace(run, parameters={k: own for k, own in run.parameters.items() if ".servo_" not in k})
+            prescribed = _run_with_prescribed_arms(run)
+            system = build_system(prescribed)
             with add_setting_location_to_errors(run, "plan"):
-                # reports a missing point before the model is compiled
-                motion_plan.moved_point_and_boxed_frames(build_system(run), run.plan)
-            step = _compile_step_for_planning(run)
+                motion_plan.moved_point_and_boxed_frames(system, run.plan)  # unknown frames, before a step is compiled
+            step = build_step(prescribed, system)
             theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
             with add_setting_location_to_errors(run, "plan"):
@@ -82,10 +83,11 @@ def run_plan(
 run_and_return_exit_code = make_command_function(run_plan)
 
 
-def _compile_step_for_planning(run: RunSettings) -> Step:
+def _run_with_prescribed_arms(run: RunSettings) -> RunSettings:
+    """The run without recordings, unless its model needs them, whose arms move as planned."""
     model = replace(run.model, arms=replace(run.model.arms, mode="prescribed"))
     recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
-    return build_step(replace(run, model=model, recordings=recordings))
+    return replace(run, model=model, recordings=recordings)
 
 
 def _configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:

@@ -297,7 +297,8 @@ def _read_table(
         names = [str(i + 1) for i in range(len(first))]
         lines = chain([(number, first)], lines)
     elif [*columns] == [str(i + 1) for i in range(len(columns))]:  # meanings in the order of the columns
-        columns = dict(zip([*names, *[*columns][len(names) :]], columns.values(), strict=False))
+        superfluous = [*columns][len(names) :]  # are refused below
+        columns = dict(zip([*names, *superfluous], columns.values(), strict=False))
     meanings, units = _meanings(names, columns, f"{path}, line {number}")
     for line, cells in lines:
         try:
