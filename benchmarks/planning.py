@@ -46,10 +46,11 @@ from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.workflow.build import build_step
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.plan import (
-    _compile_step_for_planning,
     _configured_or_recorded_start_positions,
+    _run_with_prescribed_arms,
     identified_parameters_with_covariance,
 )
 from yid_ocp.workflow.solve import run_solve
@@ -238,7 +239,7 @@ def found(run: RunSettings, folder: Path) -> tuple[Array, Step]:
         if entry["free"]:
             std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
             print(f"  {name}: {entry['value']:.4g} +- {std} {entry['unit']} (true {TRUTH.get(name, HANGING.values)})")
-    step = _compile_step_for_planning(run)
+    step = build_step(_run_with_prescribed_arms(run))
     return identified_parameters_with_covariance(
         replace(run, plan=replace(run.plan, parameter_run_folder=str(folder))), step
     )[0], step
@@ -317,7 +318,7 @@ def two_hands() -> None:
         ("middle of a cable", "plan_cable", []),
     ):
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
-        step = _compile_step_for_planning(run)
+        step = build_step(_run_with_prescribed_arms(run))
         made = plan_motion_to_target(
             step, replace(run.plan, start_joint_positions=_configured_or_recorded_start_positions(run, step))
         )
