@@ -271,7 +271,6 @@ def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
         "baseline": folders,
         "source": library.FilesCompleter(("h5", "hdf5")),
         "format": library.ChoicesCompleter(("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")),
-        "overrides": _settings,
     }
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     for command in commands.choices.values():
@@ -279,16 +278,6 @@ def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
             if action.dest in completers and action.nargs != 0:
                 action.completer = completers[action.dest]
     library.autocomplete(parser, always_complete_options="long")
-
-
-def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    from yid_ocp.config.reader import settable_keys_with_prefix  # a slow import that other completions do not need
-
-    given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
-    try:
-        return settable_keys_with_prefix(prefix, given)
-    except YidError:
-        return settable_keys_with_prefix(prefix)
 
 
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"

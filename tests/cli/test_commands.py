@@ -17,7 +17,7 @@ import pytest
 
 from yid_ocp.analysis.pinocchio_comparison import compare_urdf_with_pinocchio
 from yid_ocp.cli import COMMANDS
-from yid_ocp.config.reader import load_config, settable_keys_with_prefix
+from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import read_recording
 from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
@@ -373,7 +373,7 @@ def asked(line, tmp_path):
     return {word.strip() for word in answer.read_text().splitlines()}
 
 
-def test_commands_options_files_and_settings_are_completed(tmp_path):
+def test_commands_options_and_files_are_completed(tmp_path):
     (tmp_path / "run.yaml").write_text(FILE)
     (tmp_path / "notes.txt").write_text("")
     (tmp_path / "past").mkdir()
@@ -381,18 +381,3 @@ def test_commands_options_files_and_settings_are_completed(tmp_path):
     found = asked("yid-ocp check ", tmp_path)
     assert found >= {"run.yaml", "past/", "--json", "--set", "--strict"}
     assert "notes.txt" not in found
-    assert asked("yid-ocp solve run.yaml --set parameters.T1.t", tmp_path) == {"parameters.T1.twist."}
-
-
-def test_keys_that_may_be_set(tmp_path):
-    file = tmp_path / "run.yaml"
-    file.write_text(FILE)
-    assert settable_keys_with_prefix("problem.ti") == ["problem.time_step="]
-    assert settable_keys_with_prefix("mod") == ["model."]
-    assert settable_keys_with_prefix("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
-    assert "parameters.T1.bend.free=" in settable_keys_with_prefix("parameters.T1.bend.", file)
-    assert settable_keys_with_prefix("parameters.") == settable_keys_with_prefix("nothing.") == []
-    assert settable_keys_with_prefix("compare.methods.multi") == ["compare.methods.multiple_shooting."]
-    assert "model.object.links=" in settable_keys_with_prefix("model.object.l", file)
-    method = "compare.methods.multiple_shooting."
-    assert f"{method}condensing=" in settable_keys_with_prefix(method)

@@ -64,12 +64,6 @@ def load_config(
     return dataclasses.replace(run, name=file.stem, config_file=str(file), key_locations=places)
 
 
-def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """List the dotted setting keys that begin with `prefix`. Raises `ConfigError` if the file `path` cannot be read."""
-    data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
-    return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
-
-
 def _read(path: Path) -> str:
     files = {".urdf": f"{path} RECORDING.h5", ".xml": f"{path} RECORDING.h5", ".h5": f"ROBOT.urdf {path}"}
     if path.suffix in files:  # arguments of `init`

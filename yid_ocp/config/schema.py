@@ -91,32 +91,6 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     return ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 
-def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
-    """Yield the completions of a partly typed settings key, up to the next dot or to the `=` before a value.
-
-    `prefix` is the typed key. `hint` is the type of the value at the key `at`, which ends with a dot. `raw` is the
-    file's value at `at`; it supplies names that users choose.
-    """
-    sections, values = section_variants_from_annotation(hint), options.mapping_value_type(hint)
-    named = section_variants_from_annotation(values)
-    below: dict[str, Any] = {}
-    if sections is not None:
-        known = sections.options_of_variant(sections.read_variant_name(raw))
-        below = {name: option.type_hint for name, option in known.items()}
-    elif named is not None and named.selector_key == "name":
-        below = dict(named.classes)
-    elif values is not None and isinstance(raw, dict):
-        below = dict.fromkeys(raw, values)
-    for name, inner in below.items():
-        path = f"{at}{name}"
-        if prefix.startswith(f"{path}."):
-            said = raw.get(name) if isinstance(raw, dict) else None
-            yield from iter_settable_key_completions(inner, prefix, said, f"{path}.")
-        elif path.startswith(prefix):
-            has_keys = section_variants_from_annotation(inner) or options.mapping_value_type(inner)
-            yield f"{path}." if has_keys else f"{path}="
-
-
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     """Yield descriptions of the sections that have the key `name`. NAME represents a name that users choose."""
     for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.variadic_tuple_entry_type(hint), "")):
