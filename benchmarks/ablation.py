@@ -55,8 +55,7 @@ CRITERIA = {
     "fewest parameters first": (select, "_near_best_models", "(fit.total_effect_parameter_count, ", "(0.0, "),
     "plausible second effects": (select, "_plausible_beside", "fit.implausible_parameters(effect, limits)", "False"),
     "significant effects": (select, "_is_needed", "is_clear and all(", "is_clear or not all("),
-    "two thirds of a small gap": (verdict, "_explained_fraction", "min(least, limits", "min(math.inf, limits"),
-    "small gaps": (verdict, "_explained_fraction", "1.0 if fits_to_noise and", "1.0 if False and"),
+    "small gaps": (verdict, "_explained_fraction", "1.0 if max(is_left)", "1.0 if math.inf"),
     "size is determined": (verdict, "_reasons_against", "bool(said.undetermined_sizes(limits))", "False"),
 }
 """Conditions in code: module, function, the text and what replaces it."""

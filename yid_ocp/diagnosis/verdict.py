@@ -190,16 +190,11 @@ def _probability(said: Judgement, is_size_unknown: bool, limits: Thresholds) -> 
 
 
 def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits: Thresholds) -> float:
-    """Decrease of r'r by effects over its excess over noise; 1 if only noise, or 2/3 of a small gap, is left.
-
-    On held-out recordings alone, nothing is left where nothing was before.
-    """
-    before, left = nominal.held_out_loss, last.held_out_loss.excess_chi2_per_sample
+    """Decrease of r'r by effects over its excess over noise; 1 if only noise is left."""
     decrease = 2 * (nominal.cost - last.cost) - last.total_effect_parameter_count
     excess = max(nominal.excess_chi2, decrease, 1.0)
-    least = max(before.excess_chi2_per_sample * 2 / 3, math.sqrt(2.0 / float(before.block_sample_counts.sum())))
-    fits_to_noise = 2 * last.cost < (1 + limits.min_excess_chi2_per_dof) * last.residual_count
-    return 1.0 if fits_to_noise and left < min(least, limits.min_excess_chi2_per_dof) else decrease / excess
+    is_left = (2 * last.cost / last.residual_count - 1, last.held_out_loss.excess_chi2_per_sample)
+    return 1.0 if max(is_left) < limits.min_excess_chi2_per_dof else decrease / excess
 
 
 def _check_effect_amplitude_transfer(
