@@ -135,7 +135,7 @@ def tube_ranking(held_tube):
 def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):
     ranking, _ = tube_ranking
     base, info = ranking.unchanged_experiment, identifiability(held_tube)
-    assert (base.changes, base.description) == ((), "the experiment as it is")
+    assert (base.changes, base.description) == ((), "none (the experiment as it is)")
     assert base.verdicts == {name: entry.verdict for name, entry in info.parameters.items()}
     assert base.identifiable == sum(said == "identifiable" for said in base.verdicts.values())
     for name, entry in info.parameters.items():

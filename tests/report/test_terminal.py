@@ -213,7 +213,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
-    base = {"words": "the experiment as it is", "identifiable": 0, "gain": None, "message": ""}
+    base = {"words": "none (the experiment as it is)", "identifiable": 0, "gain": None, "message": ""}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
@@ -221,7 +221,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     assert "0 of 1 parameters can be determined" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     lines = told("yid-identifiability/1", result)
-    assert any("fewest changes that determine all: a weld." in line for line in lines)
+    assert any("Fewest changes with which all parameters would be found: a weld." in line for line in lines)
     assert line_of(lines, "estimate from FILE, a recording with a weld").endswith("'recordings.estimate=[FILE]'")
     assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"
 

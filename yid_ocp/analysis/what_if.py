@@ -170,7 +170,7 @@ def _rank_results(outcomes: Iterable[ChangedExperimentResult]) -> list[ChangedEx
 
 
 def _words(changes: Sequence[ExperimentChange]) -> str:
-    return " + ".join(change.description for change in changes) or "the experiment as it is"
+    return " + ".join(change.description for change in changes) or "none (the experiment as it is)"
 
 
 class _Outcomes:

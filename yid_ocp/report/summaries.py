@@ -301,7 +301,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if (asked := result["what_if"]) is not None:
         said = "No set of up to three changes makes it possible to find all parameters."
         if asked["smallest"]:
-            said = f"Record again with the fewest changes that determine all: {asked['smallest'][0]['words']}."
+            said = f"Fewest changes with which all parameters would be found: {asked['smallest'][0]['words']}."
         yield SummaryStatement(said, "verdict")
         rows = [("change", "parameters found", "mean ± [% of that now]")]
         now = asked["base"]["gain"]

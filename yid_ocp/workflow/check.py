@@ -216,7 +216,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     warnings += _too_stiff_start_warnings(system, theta, h, *(row["hertz"][:1] for row in (steps[0], steps[-1])))
     step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g} (extrapolated)"
-    _warn(found, f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
+    _warn(found, "the time step is", f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
         other = build_system(run, link_division=2)
@@ -225,7 +225,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
-        _warn(found, links, item.divided_links_setting_text, rows)
+        _warn(found, "the links are", links, item.divided_links_setting_text, rows)
     return found
 
 
@@ -252,7 +252,7 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 
 
-def _warn(found: dict[str, Any], when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
+def _warn(found: dict[str, Any], what: str, when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row, or say that none does."""
     moved = [
         f"number {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
@@ -262,5 +262,5 @@ def _warn(found: dict[str, Any], when: str, remedy: str, rows: list[dict[str, An
     change = f"by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}"
     said = f"natural frequencies change {change}: {', '.join(moved)}. Only if your motions excite these vibrations, set"
     found["warnings"] += [f"{said} {remedy}"] if moved else []
-    fine = f"No natural frequency changes {change}, so this is fine enough. "
+    fine = f"No natural frequency changes {change}, so {what} fine enough. "
     found["message"] += fine * (not moved and bool(rows[-1]["hertz"]))
