@@ -275,7 +275,8 @@ def _remains(result: DiagnosisResult) -> list[str]:
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     shown = {"m": (1e3, "mm")}
-    sizes = ((*shown.get(unit, (1.0, unit)), math.sqrt(square), name) for square, name, unit in beyond)
+    above = [own for own in beyond if own[0] > 0] or beyond
+    sizes = ((*shown.get(unit, (1.0, unit)), math.sqrt(square), name) for square, name, unit in above)
     worst = {unit: f"{factor * size:.2g} {unit} at {name}" for factor, unit, size, name in sizes}
     effects, places = result.accepted_effects, [own.location for own in result.remaining_gap_locations[:1]]
     who = _said((effects, "the model with the effects"), (True, "the nominal model"))[0]
