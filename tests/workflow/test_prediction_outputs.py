@@ -282,7 +282,7 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
     assert ("without the error of the time step):" in stated, "not listed: T1.twist." in lacking) == (True, True)
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
-    assert told["yaml"] == ["parameters:", "  T1.bend: {initial: 22}"]
+    assert told["yaml"] == ["parameters:", "  T1.bend: {free: true, initial: 22}"]
     assert told["mjcf"][0].startswith('<joint stiffness="22" damping="0.05"/> <!-- T1 bend, 4 links; for n links, mult')
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
     assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", [])

@@ -104,6 +104,7 @@ def copyable_estimate_texts(
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
+    starts = (f"  {name}: {{free: true, initial: {e.value:.6g}}}" for name, e in found.items())
     labels = {n: n.replace("_", r"\_") for n in found}
     told = {n: f"{e.value:.4g} ± {e.std:.2g}" for n, e in found.items()}
     rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in found.items()]
@@ -112,7 +113,7 @@ def copyable_estimate_texts(
         "uncounted_errors": list(uncounted_errors),
         "left_out": [n for n, e in estimates.items() if e.free and n not in found],
         "joints": joints,
-        "yaml": [*model_yaml, "parameters:", *(f"  {n}: {{initial: {e.value:.6g}}}" for n, e in found.items())],
+        "yaml": [*model_yaml, "parameters:", *starts],
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),
