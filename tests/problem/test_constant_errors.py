@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from small_problems import H, pendulum_step, taken
 
+from yid_ocp.analysis import estimation
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
@@ -150,3 +151,22 @@ def test_a_clock_is_uncertain_where_dampers_are_free(urdf_folder, free, effects,
     if expected is not None:
         rates = np.gradient(samples.value, H, axis=0)
         np.testing.assert_allclose(samples.change_by_clock, expected * rates, rtol=1e-6)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.03])
+def test_the_error_to_expect_contains_the_offset_of_a_clock_that_the_data_show(urdf_folder, late):
+    step = pendulum_step(urdf_folder, prescribed=tuple(BIAS))
+    sensors = {"joints.position": SensorOptions(std=1e-4), "points_mocap": SensorOptions(std=1e-4)}
+    sensors["joints.effort"] = SensorOptions(use=False)
+    made = taken(step, 3, efforts=False, camera=False)
+    mocap = replace(made.points[0], name="points_mocap", std=None)
+    first = EstimationProblem(step, [replace(made, points=(mocap,))], ("elbow.mass",), ProblemOptions(sensors=sensors))
+    exact = first.simulate_synthetic_recording(seed=1)
+    mocap = replace(exact.points[0], t=exact.points[0].t + late, clock_offset_std=0.1)
+    exact = replace(exact, name="exact", points=(mocap,))
+    problem = EstimationProblem(step, [made], ("elbow.mass",), ProblemOptions(sensors=sensors), held_out=[exact])
+    [(_, outcome)], expected = estimation._predict_held_out_with_expected_errors(problem, problem.initial_unknowns)
+    [samples] = problem.held_out[0].measurements
+    error = np.sqrt(np.nanmean(np.sum((outcome.predicted_outputs[0] - samples.value) ** 2, axis=1)))
+    assert (error > 3e-3) == (late > 0)
+    assert expected["exact"]["points_mocap.tip"] == pytest.approx(error, rel=0.15)

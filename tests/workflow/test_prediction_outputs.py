@@ -239,9 +239,10 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
 def test_a_group_without_a_sample_has_no_expected_error():
     sensor = SimpleNamespace(channel_names=("points.p",), outputs_per_channel=3)
     empty = np.zeros((0, 3))
-    nothing = SimpleNamespace(
-        sensor=sensor, value=empty, std=empty, output_changes_per_bias_and_clock_std=np.zeros((0, 3, 1))
-    )
+    slopes = np.zeros((0, 3, 0))
+    nothing = SimpleNamespace(sensor=sensor, value=empty, std=empty, output_changes_per_bias_and_clock_std=slopes)
+    vars(nothing).update(weight=empty, n_residuals=0, positive_weight_mask=empty > 0)
+    nothing.decorrelate_residual_rows = lambda rows: rows
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
     assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
 

@@ -24,7 +24,7 @@ from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMOR
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.estimation_problem import checked_unknowns, held_out_prediction_arguments
-from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.measurements import SensorMeasurements, measurements_minus_sensor_error_estimates
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_count_dicts_by_channel
 from yid_ocp.sensors.base import Sensor
@@ -333,8 +333,10 @@ def _expected_errors(
 ) -> dict[str, float]:
     found: dict[str, float] = {}
     able = [own for own in drawn if not isinstance(own, str)]
-    for k, samples in enumerate(episode.measurements):
+    without = measurements_minus_sensor_error_estimates(episode.measurements, outcome.predicted_outputs)
+    for k, (samples, corrected) in enumerate(zip(episode.measurements, without, strict=True)):
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
+        square = square + (samples.value - corrected.value) ** 2  # by constant errors and the clock's offset
         for own in able:
             square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
         found |= _rms_by_channel(samples.sensor, square)[0]

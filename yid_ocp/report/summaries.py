@@ -191,8 +191,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_large = any(error > MAX_NOISE_RATIO * noise for error, noise in known if error and noise)
     said = "An error above twice that of noise alone shows an error of the model."
     said = said if is_large else "No error exceeds twice that of noise alone, so the model predicts them well."
-    said += " Noise alone includes the effect of torque errors." * bool(result.get("torque_offsets"))
-    yield said if known else ""
+    yield f"{said} Noise alone includes expected errors of torques, sensors and clocks." if known else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
