@@ -251,7 +251,9 @@ def _length_shares(segment: FlexibleSegment) -> tuple[float, ...]:
 
 
 def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
-    per, rate = ("N m^2", "N m^2 s") if segment.values_given_as_rigidities else ("N m/rad", "N m s/rad")
+    per, rate, sizes = "N m/rad", "N m s/rad", ("{}ing stiffness of each joint", "of every coordinate")
+    if segment.values_given_as_rigidities:
+        per, rate, sizes = "N m^2", "N m^2 s", ("{}ing rigidity", "of a joint times its length")
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
     rows = [("length", length, "m", small, "length of the segment")]
@@ -263,9 +265,9 @@ def _segment_parameters(segment: FlexibleSegment) -> dict[str, Parameter]:
     for axis, size in zip("xy", segment.cross_section_size or (), strict=False):
         rows.append((f"size_{axis}", size, "m", small, f"extent of the section along {axis}"))
     rows += [
-        ("bend", segment.bend, per, 0.0, "bending stiffness of each joint, about x and y"),
-        ("twist", segment.twist, per, 0.0, "twisting stiffness of each joint, about z"),
-        ("damping", segment.damping, rate, 0.0, "viscous damping of every coordinate"),
+        ("bend", segment.bend, per, 0.0, f"{sizes[0].format('bend')}, about x and y"),
+        ("twist", segment.twist, per, 0.0, f"{sizes[0].format('twist')}, about z"),
+        ("damping", segment.damping, rate, 0.0, f"viscous damping {sizes[1]}"),
     ]
     if segment.twist_damping is not None:
         rows.append(("twist_damping", segment.twist_damping, rate, 0.0, "viscous damping of the twists"))
