@@ -268,6 +268,8 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     alike = {"which": [entry | {"closure": 0.5, "p_value": 0.0}], "effects": [entry]}
     refitted, named = (told("yid-diagnosis/2", result | alike | {"verdict": own}) for own in ("confusable", "effect"))
     assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
+    beside = told("yid-diagnosis/2", result | {"effects": which[1:], "verdict": "effect"})
+    assert "fitted beside others only  0.034    accepted" in line_of(beside, "kelvin_voigt@T2")
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)

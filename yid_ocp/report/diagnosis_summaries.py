@@ -73,6 +73,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     yield SummaryTable(rows, "Errors (rms) on held-out recordings", is_key_table=True)
+    is_computed = any(channel.startswith("joints.effort.") for channel in noise or ())
+    said = "Noise alone of efforts includes that of the joint angles, from which the model computes torques."
+    yield said if is_computed else ""
     rows = [("location", "share", "times [s]")]
     for place in result.get("where", ()):
         if place["share"] > _MIN_GAP_SHARE:
@@ -132,7 +135,8 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     others: TableRows = [("effect", "forecast parameters", "p-value", "verdict")]
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
-    verdicts |= {effect_entry_label(own): chosen for own in result.get("effects", ())}
+    added = {effect_entry_label(own): chosen for own in result.get("effects", ())}
+    verdicts |= added
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
         for name, own in entry["parameters"].items():
@@ -144,10 +148,12 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
                 values.append(f"{name} {shown}")
         label = effect_entry_label(entry)
         ends = (p_value_text(entry["p_value"]), verdicts.get(label, ""))
-        if entry["closure"] is None:
-            others.append((label, ", ".join(values), *ends))
-        else:
+        if entry["closure"] is not None:
             fitted.append((label, ", ".join(values), f"{100 * entry['closure']:.3g} %", *ends))
+        elif label in added:
+            fitted.append((label, ", ".join(values), "fitted beside others only", *ends))
+        else:
+            others.append((label, ", ".join(values), *ends))
     return fitted, others
 
 
