@@ -431,6 +431,9 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
         constants.append((joint, *(known.get(symbol, "") for symbol in symbols)))
     yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
+    sure = [name for name in friction if "@" in name and fitted[name]["verdict"] == "identifiable"]
+    rubbing = abbreviated_names_text(list(dict.fromkeys(name.rpartition(".")[0].rpartition("@")[2] for name in sure)))
+    yield f"Friction beyond viscous friction is found at: {rubbing}." if sure else ""
     said = f"These recordings do not determine {lost}."
     yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)

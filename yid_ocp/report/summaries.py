@@ -160,9 +160,8 @@ def _gap_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         told = ([e[key][c] for e in entries for c in channels if c in e.get(key, {})] for key in ("rmse", "expected"))
         error, noise = map(_rms, told)
         if error and noise and error > MAX_NOISE_RATIO * noise:
-            held, alone = (
-                " ".join(value_text_and_display_unit(x, residuals[channels[0]]["unit"])) for x in (error, noise)
-            )
+            unit = residuals[channels[0]]["unit"]
+            held, alone = (" ".join(value_text_and_display_unit(x, unit)) for x in (error, noise))
             text = f"{group} shows a gap: its held-out rms error is {held}, and noise alone gives {alone}."
             yield f"{text} Before you use any value, {advice}."
 
@@ -428,7 +427,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     warnings, coarse = result["warnings"], result["convergence"]["warnings"]
     severe, mild = (issue_descriptions(result, severe=own) for own in (True, False))
-    is_advised = bool(severe or result.get("issues") or warnings or coarse)
+    is_advised = bool(severe or result.get("issues") or warnings)
     ended, step = "No problem was found. `solve` can run.", "estimate the free parameters"
     if not result["recordings"]:
         ended = "No problem was found in the model. `solve` and `diagnose` need recordings (recordings.estimate)."
@@ -436,6 +435,8 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
     elif is_advised:
         ended = f"`solve` can run, but values may be wrong. First read the {'issues' if mild else 'warnings'} below."
+    elif coarse:
+        ended = "`solve` can run. It tests whether the coarse simulation (warnings below) changes the estimates."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
