@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Annotated, Literal, TypeVar
+from functools import cached_property, lru_cache
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
@@ -21,8 +21,6 @@ from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
-
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -386,8 +384,9 @@ def solve_equilibrium_at_point_target(
         raise ConfigError(what, where="plan.point", allowed=allowed, hint=hint)
     guess = [start.state[:n]]
 
-    @memoize_last_call
-    def rows(x: Array) -> tuple[Array, Array]:
+    @lru_cache(maxsize=1)
+    def rows(known: tuple[float, ...]) -> tuple[Array, Array]:
+        x = np.array(known)
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.is_converged:
             return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
@@ -399,7 +398,7 @@ def solve_equilibrium_at_point_target(
     lower, upper = _position_limits(system)
     begin = np.clip(first, lower + 1e-6, upper - 1e-6)
     found = least_squares(
-        lambda x: rows(x)[0], begin, jac=lambda x: rows(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
+        lambda x: rows(tuple(x))[0], begin, jac=lambda x: rows(tuple(x))[1], bounds=(lower, upper), max_nfev=100
     )
     rest = statics.solve(found.x, theta, guess=guess[0])
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - target)) if rest.is_converged else np.inf
@@ -415,15 +414,3 @@ def solve_equilibrium_at_point_target(
         where = f"plan.{'point_target_offset_from_start' if options.target_position is None else 'target_position'}"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
-
-
-def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """Wrap a function so that a second call with the same argument returns the value of the first call."""
-    last: list[tuple[Array, _Value]] = []
-
-    def at(x: Array) -> _Value:
-        if not last or not np.array_equal(last[-1][0], x):
-            last[:] = [(np.array(x), function(x))]
-        return last[-1][1]
-
-    return at

@@ -24,7 +24,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
+from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions
 from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 
 _LIMIT_NODE_STRIDE = 2  # node spacing at which limits on free coordinates are evaluated
@@ -202,14 +202,14 @@ class MotionToTargetSearch:
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
-        self._residual_and_limit_values = memoize_last_call(self._evaluated)
+        self._residual_and_limit_values = functools.lru_cache(maxsize=1)(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 
-    def _evaluated(self, x: Array) -> tuple[Array, Array, Array, Array]:
+    def _evaluated(self, x: tuple[float, ...]) -> tuple[Array, Array, Array, Array]:
         """Residual, scaled limit values and the Jacobians of both; not finite if a rollout fails."""
         self.evaluations += 1
-        w = x.reshape(self._shape)
+        w = np.reshape(x, self._shape)
         rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
         pairs = zip(self._cases, rollouts, strict=True)
         parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
@@ -233,7 +233,7 @@ class MotionToTargetSearch:
             stop = {"max_nfev": iterations, "ftol": 1e-6, "xtol": 1e-7, "gtol": 1e-8}
             found = least_squares(value, x, jac=slope, bounds=(low, high), x_scale=1.0, **stop)
             x, ended = found.x, found.status > 0
-            reached = self._residual_and_limit_values(x)[2]
+            reached = self._residual_and_limit_values(tuple(x))[2]
             over = np.vstack([reached - self._upper, self._lower - reached])
             passed = float(np.max(over, initial=0.0))
             if passed <= _LIMIT_TOLERANCE or not np.isfinite(passed):
@@ -250,7 +250,7 @@ class MotionToTargetSearch:
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
-        residual, by_x, limited, limits_by_x = self._residual_and_limit_values(x)
+        residual, by_x, limited, limits_by_x = self._residual_and_limit_values(tuple(x))
         root = np.sqrt(penalty)
         # cost plus one: the search ends if the cost falls by little compared with a reached target
         values, slopes = [np.ones(1), residual], [np.zeros((1, len(x))), by_x]
