@@ -217,23 +217,17 @@ class PathSimulator:
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
         """Simulate the path with coefficients `w` (K, nc).
 
-        The rollout has sensitivities to the parameters `names` and then, if `slopes`, to the K nc coefficients.
+        The rollout has sensitivities to the K nc coefficients if `slopes`, else to the parameters `names`.
         """
-        directions = None
-        if slopes or names:
-            size = w.size if slopes else 0
-            nodes, nc = len(self.node_times), len(self.moved_joint_indices)
-            by_path = np.zeros((nodes, nc, len(names) + size))
-            start = np.zeros((len(self.start_equilibrium.state), len(names) + size))
-            if slopes:
-                by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
-            if names:
-                known, guess = self.moved_joint_start_positions, self.system_start_configuration
-                rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
-                start[:, : len(names)] = rest.state_by_theta
-            directions = SensitivityDirections(tuple(names), start, None, by_path)
-        begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
-        return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
+        begin, nodes, directions = self.start_equilibrium.state, len(self.node_times), None
+        if slopes:
+            by_path = np.kron(self._basis, np.eye(w.shape[1])).reshape(nodes, w.shape[1], w.size)
+            directions = SensitivityDirections((), np.zeros((len(begin), w.size)), prescribed_tangents=by_path)
+        elif names:
+            known, guess = self.moved_joint_start_positions, self.system_start_configuration
+            rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
+            directions = SensitivityDirections(tuple(names), rest.state_by_theta)
+        return simulate(self.step, self.theta, begin, nodes - 1, path=self.joint_positions(w), directions=directions)
 
     def frame_positions_along_states(self, frames: FramePositionEvaluator, state: Array) -> Array:
         """Return the positions of frames along a trajectory (N, nx), shape (N, frames, 3) [m]."""

@@ -244,7 +244,7 @@ def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: Paramete
     rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
     _, by_q = rows.point.positions_and_jacobian(rollout.state[end, :n], mover.theta)
-    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, : len(known.parameter_names)])
+    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n])
 
 
 def _outcome(

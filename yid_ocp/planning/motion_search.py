@@ -86,7 +86,7 @@ class PlanResidualAndLimitFunctions:
         assert rollout.state_sensitivity is not None
         assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
-        by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
+        by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n])
         end, course = mover.node_indices_after_motion, self.desired_point_trajectory
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
@@ -95,12 +95,12 @@ class PlanResidualAndLimitFunctions:
         if course is not None:
             parts.append(_rows(at[:, :3] - course, by_w[:, :3], reached))
         bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
-        parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
+        parts.append(_rows(bend @ w, np.kron(bend, np.eye(w.shape[1])), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
             finite = np.isfinite(self._effort_limit)
             unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
-            by_effort = rollout.effort_sensitivity[:, finite, -size:] / unit[:, None]
+            by_effort = rollout.effort_sensitivity[:, finite] / unit[:, None]
             parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
         return parts
 
@@ -113,15 +113,16 @@ class PlanResidualAndLimitFunctions:
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
-        parts: list[tuple[Array, Array | None]] = [(matrix @ w, _by_coefficients(matrix, w)) for matrix in controls]
+        one = np.eye(w.shape[1])  # the derivative of matrix @ w is a Kronecker product
+        parts: list[tuple[Array, Array | None]] = [(matrix @ w, np.kron(matrix, one)) for matrix in controls]
         finite = np.isfinite(self._effort_limit)
-        parts.append((rollout.effort[every, finite], None if pushed is None else pushed[every, finite, -size:]))
+        parts.append((rollout.effort[every, finite], None if pushed is None else pushed[every, finite]))
         if self.options.limits.max_spring_angle is not None:
-            slope = None if moved is None else moved[every, self._springs, -size:]
+            slope = None if moved is None else moved[every, self._springs]
             parts.append((rollout.state[every, self._springs], slope))
         if self.inside is not None:
             at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
-            parts.append((at, None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])))
+            parts.append((at, None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n])))
         value = np.concatenate([rows.ravel() for rows, _ in parts])
         slopes = [slope.reshape(-1, size) for _, slope in parts if slope is not None]
         return value, np.vstack(slopes) if len(slopes) == len(parts) else None
@@ -163,11 +164,6 @@ class PlanResidualAndLimitFunctions:
                 bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
                 found[rows.description] = (rows.row_names[worst], float(own[worst]), float(bound))
         return found
-
-
-def _by_coefficients(matrix: Array, w: Array) -> Array:
-    """Derivative of `matrix @ w` by the coefficients, row by row."""
-    return np.einsum("tk,ji->tjki", matrix, np.eye(w.shape[1])).reshape(-1, w.size)
 
 
 def _rows(value: Array, slope: Array, unit: float) -> tuple[Array, Array]:
