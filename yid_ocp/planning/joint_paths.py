@@ -156,8 +156,7 @@ class RestToRestSplineBasis:
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
         """Return the values (N, K) of K basis functions or their `order`-th time derivatives at times `t` (N,) [s]."""
-        values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
-        return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
+        return np.asarray(self._splines(order)(np.minimum(t, self.duration)))
 
     def straight_line_coefficients(self, change: Array) -> Array:
         """Return the coefficients (K, nj) of a straight path in joint space with the total motion `change` (nj,)."""

@@ -98,10 +98,8 @@ class PlanResidualAndLimitFunctions:
         parts.append(_rows(bend @ w, np.kron(bend, np.eye(w.shape[1])), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
-            finite = np.isfinite(self._effort_limit)
-            unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
-            by_effort = rollout.effort_sensitivity[:, finite] / unit[:, None]
-            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
+            unit = self._effort_limit / np.sqrt(options.effort_weight)
+            parts.append(_rows(rollout.effort / unit, rollout.effort_sensitivity / unit[:, None], 1.0))
         return parts
 
     def constraints_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
@@ -115,8 +113,7 @@ class PlanResidualAndLimitFunctions:
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
         one = np.eye(w.shape[1])  # the derivative of matrix @ w is a Kronecker product
         parts: list[tuple[Array, Array | None]] = [(matrix @ w, np.kron(matrix, one)) for matrix in controls]
-        finite = np.isfinite(self._effort_limit)
-        parts.append((rollout.effort[every, finite], None if pushed is None else pushed[every, finite]))
+        parts.append((rollout.effort[every], None if pushed is None else pushed[every]))
         if self.options.limits.max_spring_angle is not None:
             slope = None if moved is None else moved[every, self._springs]
             parts.append((rollout.state[every, self._springs], slope))
@@ -135,10 +132,8 @@ class PlanResidualAndLimitFunctions:
         count = len(mover.path.coefficients_to_control_points_matrix())
         found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
         found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
-        finite = np.isfinite(self._effort_limit)
         steps = len(range(0, len(mover.node_times) - 1, _LIMIT_NODE_STRIDE))
-        able = tuple(name for name, one in zip(names, finite, strict=True) if one)
-        found.append(_even("effort [N m or N]", able, self._effort_limit[finite], steps))
+        found.append(_even("effort [N m or N]", names, self._effort_limit, steps))
         nodes = len(range(0, len(mover.node_times), _LIMIT_NODE_STRIDE))
         if limits.max_spring_angle is not None:
             springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
