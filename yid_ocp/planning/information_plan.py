@@ -312,7 +312,7 @@ def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion
         rows = experiment.planned_recording_sensitivities(found.w)
     except SolverError:
         return -math.inf
-    return criterion.value_and_gradient_wrt_sensitivities(rows, False)[0]
+    return criterion.value_and_gradient_wrt_sensitivities(rows)[0]
 
 
 def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:

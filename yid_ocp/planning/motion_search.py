@@ -273,17 +273,14 @@ class DOptimalityCriterion:
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
-    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
+    def value_and_gradient_wrt_sensitivities(self, rows: Array) -> tuple[float, Array]:
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
         own = whole[np.ix_(chosen, chosen)]
-        found = -0.5 * float(np.linalg.slogdet(own)[1])
-        if not slope:
-            return found, np.zeros((0, 0))
         wide = whole[:, chosen]  # d C = -C d(J'J) C
-        return found, rows @ (wide @ np.linalg.solve(own, wide.T))
+        return -0.5 * float(np.linalg.slogdet(own)[1]), rows @ (wide @ np.linalg.solve(own, wide.T))
 
 
 @dataclass(frozen=True)
@@ -306,18 +303,17 @@ class EffectDiscriminationCriterion:
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
-    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
+    def value_and_gradient_wrt_sensitivities(self, rows: Array) -> tuple[float, Array]:
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
             weight = 1.0 / (1.0 + square)
             total += weight
-            if slope:
-                factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
-                by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
-                by_rows[:, others] -= factor * rest @ used.T
-        return -0.5 * float(np.log(total)), 0.5 * by_rows / total if slope else np.zeros((0, 0))
+            factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
+            by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
+            by_rows[:, others] -= factor * rest @ used.T
+        return -0.5 * float(np.log(total)), 0.5 * by_rows / total
 
     def _apart(self, rows: Array, i: int, j: int) -> tuple[float, Array, list[int], Array]:
         """Squared distance, unexplained change by effect i, and columns and coefficients that imitate it."""
@@ -383,7 +379,7 @@ class InformativeMotionSearch:
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; the criterion is minus infinity if the rollout fails."""
         rows = self.experiment.sensitivities_to_unknowns(w)
-        return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows, False)[0], rows
+        return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
         """Maximise the criterion in at most `rounds` rounds from coefficients `start` (K, nc) within the limits."""
