@@ -10,6 +10,7 @@ import functools
 import logging
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,26 +150,22 @@ def effect_joint_terms_and_changed_aspects(
 
 def system_joint_dynamics_terms(system: System, value: CasadiEvaluator) -> dict[str, JointDynamicsTerms]:
     """Return the springs, dampers, rotor inertia and friction of each joint, from description and joint effects."""
-    found: dict[str, JointDynamicsTerms] = {}
-
-    def add(joint: str, own: JointDynamicsTerms) -> None:
-        found[joint] = found.get(joint, JointDynamicsTerms()) + own
-
+    found = defaultdict[str, JointDynamicsTerms](JointDynamicsTerms)
     for joint, coefficient in system.joint_damping.items():
-        add(joint, JointDynamicsTerms(damping=float(value(coefficient)[0])))
+        found[joint] += JointDynamicsTerms(damping=float(value(coefficient)[0]))
     for joint, servo in system.servos.items():
         if servo.motor_kind == "dc":  # the limit of its duty cycle does not limit the counter-voltage
-            add(joint, JointDynamicsTerms(damping=float(value(servo.damping)[0])))
+            found[joint] += JointDynamicsTerms(damping=float(value(servo.damping)[0]))
     for spring in system.elastic_joints:
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
-        add(spring.joint_name, JointDynamicsTerms(stiffness, stiffness * rest, damping=damping))
+        found[spring.joint_name] += JointDynamicsTerms(stiffness, stiffness * rest, damping=damping)
     for joint, compliance in system.joint_compliances.items():
         if not value._is_zero_at_parameter_values(compliance):
-            stiffness = 1 / float(value(compliance)[0])
-            add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
+            stiffness, relaxation = 1 / float(value(compliance)[0]), system.joint_relaxation_times.get(joint, 0.0)
+            found[joint] += JointDynamicsTerms(stiffness, damping=relaxation * stiffness)
     for effect in (own for own in system.effects if not value.is_effect_neutral(own)):
         for joint, own in effect_joint_terms_and_changed_aspects(system, effect, value)[0].items():
-            add(joint, own)
+            found[joint] += own
     return found
 
 
