@@ -24,7 +24,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, ModelError, import_optional
+from yid_ocp.errors import ModelError, import_optional
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, depends_on_symbols, merge_inertias
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
@@ -235,8 +235,7 @@ def mujoco_xml(
     values: Mapping[str, float] | None = None,
     *,
     time_step: float = 5e-4,
-    emulate: bool = False,
-    actuators: bool = False,
+    standalone: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
     """Return a system as a MuJoCo model in MJCF, an XML text.
@@ -250,22 +249,18 @@ def mujoco_xml(
     ----------
     time_step : float
         Time step of the simulator [s]. Grasps are constraints with a time constant of two steps.
-    emulate : bool
-        Whether approximations are allowed: sticking for smoothed dry friction, a tendon for a compliant point grasp.
-        Otherwise a system that needs them raises an error.
-    actuators : bool
-        Whether each driven joint has an actuator of its name, whose control is the recorded torque, and whose gain,
-        offset, delay and lag give the applied torque. Without actuators, apply true torques as `qfrc_applied`. A servo
-        always is an actuator, whose control is the command.
+    standalone : bool
+        Whether the model is for use without this package. Approximations are then allowed: sticking for smoothed dry
+        friction, a tendon for a compliant point grasp. Otherwise a system that needs them raises an error. Each driven
+        joint then has an actuator of its name, whose control is the recorded torque, and whose gain, offset, delay and
+        lag give the applied torque. Otherwise, apply true torques as `qfrc_applied`. A servo always is an actuator,
+        whose control is the command.
     gear_play : mapping of joint name to float, optional
         Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
     """
-    if not time_step > 0:
-        what, hint = f"time_step is {time_step}, but must be above 0", "pass for example time_step=0.0005"
-        raise ConfigError(what, where="mujoco_xml", allowed="a number above 0 [s]", hint=hint)
     tree, weights = _weighed(system.mechanism_with_values(values))
     value = CasadiEvaluator(system, values)
-    _refuse_inexpressible(system, value, emulate)
+    _refuse_inexpressible(system, value, standalone)
 
     root = Element("mujoco", model=tree.name)
     SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
@@ -285,7 +280,7 @@ def mujoco_xml(
     for name, frame in sites:
         SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
-    if actuators or system.servos:
+    if standalone or system.servos:
         _add_actuators(system, value, SubElement(root, "actuator"), time_step)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -434,9 +429,9 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
         raise ModelError(what, where="MJCF text", allowed="MJCF that MuJoCo compiles", hint=hint) from error
 
 
-def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool) -> None:
+def _refuse_inexpressible(system: System, value: CasadiEvaluator, standalone: bool) -> None:
     native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
-    able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
+    able = native | MUJOCO_APPROXIMATED_ASPECTS if standalone else native
     for effect in system.effects:
         if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS:
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
@@ -445,9 +440,9 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
             hint = "leave the effect out of model.effects or model.friction"
             raise ModelError(what, where=where, allowed=allowed, hint=hint)
     for grasp in system.grasps:
-        if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
-            allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
-            what = f"MuJoCo has no {'exact ' * (not emulate)}term for a compliant grasp of the kind {grasp.kind}"
+        if not value._is_zero_at_parameter_values(grasp.compliance) and not (standalone and grasp.kind == "point"):
+            allowed = "rigid grasps" if not standalone else "rigid grasps, or compliant grasps of the kind point"
+            what = f"MuJoCo has no {'exact ' * (not standalone)}term for a compliant grasp of the kind {grasp.kind}"
             hint = f"leave out the effect grasp_compliance@{grasp.name}"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
