@@ -161,8 +161,6 @@ def _square_distances(points: Array, place: Array) -> Array:
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
     """Return the mean of the points (N, 3) in each voxel of edge `size` [m], weighted by the number of these points."""
-    if not len(points):
-        return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
     extent = cell.max(0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
@@ -269,10 +267,7 @@ def _near(points: Array, centre: Array, neighbour_radius: float) -> IntArray:
 
 def _spanning_forest(nodes: Array) -> tuple[IntArray, IntArray]:
     """Edges (E, 2) of the shortest forest that connects near nodes, and the connected part (K,) of each node."""
-    count = len(nodes)
-    if count < 2:
-        return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
-    k = min(_NODE_NEIGHBOURS + 1, count)
+    count, k = len(nodes), _NODE_NEIGHBOURS + 1
     distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=MAX_EDGE_LENGTH)
     rows = np.repeat(np.arange(count), k)
     columns, lengths = index.ravel(), distance.ravel()
@@ -292,8 +287,6 @@ def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, diame
     neighbour_radius = max(_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS * diameter)
     nodes, size, label = _thin_to_nodes(cloud, rng, neighbour_radius)
     edges, part = _spanning_forest(nodes)
-    if not len(nodes):
-        return CloudSkeleton(nodes, label, edges, part)
     held = np.bincount(part, size)
     rank = np.argsort(np.argsort(-held, kind="stable"))
     keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()

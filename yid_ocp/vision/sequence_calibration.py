@@ -50,8 +50,6 @@ class BackgroundPoints:
 
     def near_background_mask(self, points: Array, beyond: float = 0.0) -> BoolArray:
         """Check which points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
-        if not len(self.points) or not len(points):
-            return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
 
     @staticmethod

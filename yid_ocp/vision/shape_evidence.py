@@ -223,8 +223,6 @@ def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) ->
 def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:
     """Index (N,) of the large connected part of each chosen point, 0 for the largest part; -1 for all other points."""
     part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
-    if not len(index):
-        return part
     pairs = cKDTree(tree.data[index]).query_pairs(within, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
     owner = connected_components(graph, directed=False)[1]
@@ -241,8 +239,6 @@ def _contacts(
 ) -> BoolArray:
     """Mask of the shape's points that touch foreign points: these are at least half as dense within `within` [m]."""
     contact = np.zeros(len(shape), bool)
-    if not foreign.any():
-        return contact
     close = cKDTree(seen.points[foreign]).query(seen.points[shape], distance_upper_bound=within)[0]
     for i in np.flatnonzero(shape)[np.isfinite(close)]:
         around = np.asarray(tree.query_ball_point(seen.points[i], within), dtype=np.int64)

@@ -146,8 +146,6 @@ def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, 
 
 def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
     """Shortest edges that connect all nodes, and positions of omitted edges that close loops over `loop` [m]."""
-    if not len(edges):
-        return edges, np.empty((0, 3))
     forest = minimum_spanning_tree(_graph(nodes, edges)).tocoo()
     tree = np.column_stack([forest.row, forest.col]).astype(np.int64)
     one, other = edges.T
