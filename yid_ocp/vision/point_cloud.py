@@ -224,7 +224,6 @@ class CloudSkeleton:
     nodes: Array  # (K, 3), centroids of the kept segments, in order of extraction [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
     edges: IntArray  # (E, 2), minimum spanning forest of the nodes' nearest-neighbour graph
-    component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
 
 def _thin_to_nodes(
@@ -286,11 +285,10 @@ def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, diame
     """
     neighbour_radius = max(_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS * diameter)
     nodes, size, label = _thin_to_nodes(cloud, rng, neighbour_radius)
-    edges, part = _spanning_forest(nodes)
+    _, part = _spanning_forest(nodes)
     held = np.bincount(part, size)
-    rank = np.argsort(np.argsort(-held, kind="stable"))
     keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()
     renamed = np.full(len(nodes) + 1, -1)
     renamed[:-1][keep] = np.arange(int(keep.sum()))
     edges, _ = _spanning_forest(nodes[keep])
-    return CloudSkeleton(nodes[keep], renamed[label], edges, rank[part[keep]])
+    return CloudSkeleton(nodes[keep], renamed[label], edges)

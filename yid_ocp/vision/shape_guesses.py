@@ -51,8 +51,7 @@ class _Centerline:
     @property
     def to_skeleton(self) -> CloudSkeleton:
         """Skeleton with the same nodes and edges, without points."""
-        none = np.empty(0, dtype=np.int64)
-        return CloudSkeleton(self.nodes, none, self.edges, np.zeros(len(self.nodes), dtype=np.int64))
+        return CloudSkeleton(self.nodes, np.empty(0, dtype=np.int64), self.edges)
 
     def outward_direction(self, end: int) -> Array:
         """Unit vector (3,) along the object at one of its ends, away from it."""
