@@ -127,12 +127,8 @@ class ShapeFitter:
         """Fit the object's shape in one frame, given the robot's configuration `q_known` (n,).
 
         The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
-        shape). Passes on points run from the best result. Raises `DataError` if the filtered `cloud` has no points.
+        shape). Passes on points run from the best result. The filtered `cloud` has points and nodes of their skeleton.
         """
-        if not len(cloud.points) or not len(cloud.skeleton_nodes):
-            what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
-            hint = "pass a cloud with points; if filters removed them, loosen track.options.filters"
-            raise DataError(what, where="cloud", allowed="points and skeleton_nodes of shape (n, 3), n >= 1", hint=hint)
         free, q = list(self.free_joints), self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
