@@ -480,27 +480,6 @@ class DepthCameraModel:
         return np.asarray(disparity < nearest[flat] - 1.0)
 
 
-@dataclass(frozen=True)
-class VirtualCameraTiming:
-    """The timing of a virtual camera: frame rate, dropped frames and errors of time stamps."""
-
-    mean_rate: float = 3.0  # [Hz]
-    dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
-    latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
-    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
-
-    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
-        if not self.mean_rate > 0:
-            what, hint = f"mean_rate is {self.mean_rate}, but must be above 0", "pass for example mean_rate=3.0"
-            raise ConfigError(what, where="VirtualCameraTiming", allowed="a frame rate above 0 [Hz]", hint=hint)
-        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
-        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
-        taken = taken[taken < stop]
-        taken = taken[rng.random(len(taken)) >= self.dropped_frame_fraction]
-        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
-
-
 @dataclass(frozen=True, eq=False)
 class VirtualFramesWithTruth:
     """The frame sequence of a virtual camera, with the true capture times and the true motion."""
@@ -512,12 +491,23 @@ class VirtualFramesWithTruth:
 
 @dataclass(frozen=True, eq=False)
 class VirtualCameraSetup:
-    """A virtual depth camera, described by sensor model, pose and frame timing."""
+    """A virtual depth camera, described by pose, sensor model, frame rate, dropped frames and errors of time stamps."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthCameraModel = field(default_factory=DepthCameraModel)  # default: an Asus Xtion Pro Live
-    timing: VirtualCameraTiming = field(default_factory=VirtualCameraTiming)
+    mean_rate: float = 3.0  # [Hz]
+    dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
+    latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
+    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
     seed: int = 0  # seed of all random draws
+
+    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
+        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
+        taken = taken[taken < stop]
+        taken = taken[rng.random(len(taken)) >= self.dropped_frame_fraction]
+        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
 
 
 def render_virtual_frames(
@@ -530,7 +520,7 @@ def render_virtual_frames(
     """
     lens, pose = camera.sensor_model.intrinsics, frames.validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
-    taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
+    taken, stamps = camera._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, np.asarray(q, float), axis=0)
     configuration = np.asarray(course(taken))
     tree = scene.system.mechanism_with_values(scene.parameter_values)
