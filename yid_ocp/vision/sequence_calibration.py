@@ -260,7 +260,6 @@ def estimate_and_check_tube_dimensions(
     nothing = TubeDimensionEstimates(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
-    covariance, frames = nothing.covariance, 0
     for turn in range(_MAX_DIMENSION_ITERATIONS):
         fits = fitted(_changed(system, given, change), starts)
         chosen = _believed(fits)
