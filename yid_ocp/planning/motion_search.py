@@ -195,11 +195,9 @@ class MotionToTargetSearch:
         self._cases, self._shape = list(cases), shape
         self._residual_and_limit_values = functools.lru_cache(maxsize=1)(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
-        self.evaluations = 0
 
     def _evaluated(self, x: tuple[float, ...]) -> tuple[Array, Array, Array, Array]:
         """Residual, scaled limit values and the Jacobians of both; not finite if a rollout fails."""
-        self.evaluations += 1
         w = np.reshape(x, self._shape)
         rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
         pairs = zip(self._cases, rollouts, strict=True)
@@ -237,7 +235,8 @@ class MotionToTargetSearch:
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
-        return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
+        evaluations = self._residual_and_limit_values.cache_info().misses
+        return MotionToTargetResult(x.reshape(self._shape), finished, message, evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
