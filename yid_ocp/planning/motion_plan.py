@@ -95,17 +95,16 @@ def plan_motion_to_target(
     end = solve_equilibrium_at_point_target(step, values, start, point, place, options)
     check_rest_effort_and_spring_limits(step, values, end, options.limits, "where it ends")
     joints = [system.mechanism.joints[i] for i in mover.moved_joint_indices]
-    travel = np.abs(end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions)
-    least = travel / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
+    travel = end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions
+    least = np.abs(travel) / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
     if options.duration < (shortest := float(least.max())):
-        name, turn = joints[int(least.argmax())].name, travel[int(least.argmax())]
+        name, turn = joints[int(least.argmax())].name, abs(travel[int(least.argmax())])
         what = f"joint {name} would move by {turn:.3g} rad or m in {options.duration:g} s, faster than its speed limit"
         hint = "set a longer plan.duration, or a target nearer to the start"
         raise ConfigError(what, where="plan.duration", allowed=f"at least {shortest:.3g} s", hint=hint)
 
     def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
-        travel = end.state[own.moved_joint_indices] - own.moved_joint_start_positions
         straight = own.path.straight_line_coefficients(travel)
         rows = PlanResidualAndLimitFunctions(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
