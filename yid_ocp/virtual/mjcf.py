@@ -35,9 +35,7 @@ _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of fric
 _N_COMPARED_STATES = 3  # number of random states at which an effect's equations are compared with joint terms
 _ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
-# aspects of sensors and recorded torques, which do not enter the mechanics
-_IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
-_NON_NATIVE_ASPECTS = MUJOCO_APPROXIMATED_ASPECTS | _IGNORED_ASPECTS | {"servo_firmware", "clock", "memory", "force"}
+_INEXPRESSIBLE_ASPECTS = frozenset({"servo_firmware", "clock", "memory", "force"})  # of the mechanics
 
 _JOINTS_PER_BODY = 6  # MuJoCo's limit
 _ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as small as stability at a stop allows
@@ -430,10 +428,9 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: CasadiEvaluator, standalone: bool) -> None:
-    native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
-    able = native | MUJOCO_APPROXIMATED_ASPECTS if standalone else native
+    lacking = _INEXPRESSIBLE_ASPECTS if standalone else _INEXPRESSIBLE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS
     for effect in system.effects:
-        if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS:
+        if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] & lacking:
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
             where, allowed = f"effect '{effect.kind}@{effect.location}'", "effects that docs/howto/export.md lists"
@@ -454,9 +451,6 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, standalone: bo
         if not value._is_zero_at_parameter_values(servo.dead_band):
             key, what = f"parameters.{joint}.servo_dead_band.initial", f"servo '{joint}' has a dead band, MuJoCo none"
             raise ModelError(what, where=key, allowed="0", hint=f"add --set {key}=0")
-    if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave out the effect clock_scale"
-        raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:
