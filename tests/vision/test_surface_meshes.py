@@ -203,7 +203,7 @@ def test_tubes_have_their_lengths_and_radii(system):
 def test_what_cannot_be_seen_is_said(tmp_path, tree):
     with pytest.raises(DataError, match="no object"):
         tubes(System.build(tree))
-    with pytest.raises(ModelError, match="no URDF file"):
+    with pytest.raises(ModelError, match="URDF cannot be read: there is no such file"):
         load_robot_meshes_by_joint(tmp_path / "none.urdf", tree)
     bare = tmp_path / "bare.urdf"
     bare.write_text('<robot name="bare"><link name="base"/></robot>')

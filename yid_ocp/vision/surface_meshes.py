@@ -269,14 +269,11 @@ def load_robot_meshes_by_joint(urdf: str | Path, mechanism: Mechanism) -> dict[i
     import yourdfpy
 
     path = urdf_path_from_robot_name(urdf)
-    if not is_file(path):
-        what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
-        raise ModelError(what, where=str(urdf), allowed=allowed, hint="set model.robot to one, such as package:ur5")
     bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        reason = f"an element has no {error}" if isinstance(error, KeyError) else error
+        reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
         what, hint = f"the URDF cannot be read: {reason}", "check it with check_urdf, or export it again"
         raise ModelError(what, where=str(path), allowed="a URDF file with links and joints", hint=hint) from error
     parts: dict[int, list[TriangleMesh]] = {}
