@@ -203,23 +203,19 @@ def _joint_terms(system: System, effect: Effect, value: CasadiEvaluator) -> dict
     momentum = ca.gradient(energy, v)
     if depends_on_symbols(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
         return None
-    ones = ca.SX.ones(n)
-    by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
-    second = ca.jtimes(ca.diag(by_q), q, ones)
-    slopes = [ca.diag(by_v), ca.diag(inertia), ca.jtimes(second, q, ones)]
-    mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
-    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
-    rng = np.random.default_rng(0)
-    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_N_COMPARED_STATES)]
-    rest = [np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n))[:6]]
-    pull, slope, curve, damping, armature, twisted = rest
-    scale = _ROUNDING_TOLERANCE * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
-    moved = [np.abs(entry[i].ravel() - rest[i]).max() for entry in found for i in range(3, 3 + len(slopes))]
-    constant = all(size <= scale for size in moved)
-    apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
-    springs = np.abs(curve).max() <= scale and damping.max() <= scale and armature.min() >= -scale
+    by_q, ones = ca.diag(ca.jacobian(force, q)), ca.SX.ones(n)
+    third = ca.jtimes(ca.jtimes(by_q, q, ones), q, ones)
+    slopes = by_q, third, ca.diag(ca.jacobian(force, v)), ca.diag(ca.jacobian(momentum, v))
+    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, momentum, *slopes)])
+    pull, _, *rest = (np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n)))
+    slope, twisted, damping, armature = rest
+    scale = _ROUNDING_TOLERANCE * max(1.0, float(np.abs([pull, *rest]).max()))
+    for x, rate in np.random.default_rng(0).uniform(-1.0, 1.0, (_N_COMPARED_STATES, 2, n)):
+        likely = [pull + slope * x + twisted / 6 * x**3 + damping * rate, armature * rate]
+        if not np.abs(np.squeeze(at(x, rate)[:2], 2) - likely).max() <= scale:  # also if it is not a number
+            return None
     loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is not a spring
-    if not (constant and apart and springs) or np.any(loose):
+    if damping.max() > scale or armature.min() < -scale or np.any(loose):
         return None
     return {
         joint: JointDynamicsTerms(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
