@@ -253,6 +253,7 @@ class PlannedMotion:
     rollout: Rollout
     is_successful: bool  # whether a motion within the limits reaches the goal, or the search for the best one converged
     message: str
+    target_point: str | None = field(default=None, kw_only=True)  # point that a target is for; None without a target
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -288,13 +289,9 @@ class PlannedMotion:
     def point_trajectories(self) -> dict[str, Array]:
         """The world trajectories (N + 1, 3) [m] of the system's points and of the target point, if any, by name."""
         system = self.simulator.step.system
-        names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
+        names = tuple(dict.fromkeys((*system.point_frames, *filter(None, [self.target_point]))))
         places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
-
-    @property
-    def _further_points(self) -> tuple[str, ...]:
-        return ()
 
 
 def _position_limits(system: System) -> tuple[Array, Array]:

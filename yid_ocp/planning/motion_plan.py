@@ -49,17 +49,12 @@ class TargetMotionPlan(PlannedMotion):
     The time step of its simulation is shorter than that of the planner's argument `step` if accuracy required halving.
     """
 
-    target_point: str
     target_position: Array  # (3,) [m]
     max_position_error: float  # largest distance of the point from its target during the final standstill [m]
     max_residual_speed: float  # largest speed of a point of the object in that time [m/s]
     max_path_deviation: float | None  # largest distance from the reference path [m]; None without one
     end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
     n_evaluations: int  # motions that the search simulated with derivatives
-
-    @property
-    def _further_points(self) -> tuple[str, ...]:
-        return (self.target_point,)
 
 
 def plan_motion_to_target(
@@ -278,7 +273,8 @@ def _outcome(
         message += "Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
-    return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
+    point = rows.point.names[0]
+    return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.target, *errors, target_point=point)
 
 
 def _shortest(
