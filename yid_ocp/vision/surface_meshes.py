@@ -442,10 +442,8 @@ class DepthCameraModel:
         from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
 
         scale, shape = self.intrinsics.fx * self.baseline, depth.shape
-        white = rng.standard_normal(shape)
-        if self.noise_correlation_length > 0:
-            white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
-            white /= white.std()
+        white = gaussian_filter(rng.standard_normal(shape), self.noise_correlation_length, mode="wrap")
+        white /= white.std()
         chance, far = rng.random((4, *shape)), np.where(np.isfinite(depth), depth, 1e3)
         front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
         edge = back - front > self.min_relative_edge_depth * front
