@@ -285,10 +285,15 @@ def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, diame
     """
     neighbour_radius = max(_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS * diameter)
     nodes, size, label = _thin_to_nodes(cloud, rng, neighbour_radius)
-    _, part = _spanning_forest(nodes)
+    edges, part = _spanning_forest(nodes)
     held = np.bincount(part, size)
     keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()
-    renamed = np.full(len(nodes) + 1, -1)
-    renamed[:-1][keep] = np.arange(int(keep.sum()))
-    edges, _ = _spanning_forest(nodes[keep])
-    return CloudSkeleton(nodes[keep], renamed[label], edges)
+    renamed = indices_among_kept(np.flatnonzero(keep), len(nodes) + 1)  # the last entry is that of points without node
+    return CloudSkeleton(nodes[keep], renamed[label], renamed[edges[keep[edges[:, 0]]]])
+
+
+def indices_among_kept(kept: IntArray, count: int) -> IntArray:
+    """Return the index of each of `count` entries among the entries `kept`, -1 for the others."""
+    numbers = np.full(count, -1)
+    numbers[kept] = np.arange(len(kept))
+    return numbers

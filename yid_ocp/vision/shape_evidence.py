@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
-from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
+from yid_ocp.vision.point_cloud import MAD_TO_STD, indices_among_kept, weighted_median
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
 _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
@@ -227,10 +227,9 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
     owner = connected_components(graph, directed=False)[1]
     count = np.bincount(owner)
-    order, number = np.argsort(-count, kind="stable"), np.full(len(count), -1)
+    order = np.argsort(-count, kind="stable")
     kept = order[count[order] >= max(least, _MIN_THING_POINTS)]
-    number[kept] = np.arange(len(kept))
-    part[index] = number[owner]
+    part[index] = indices_among_kept(kept, len(count))[owner]
     return part
 
 

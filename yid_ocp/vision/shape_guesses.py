@@ -29,7 +29,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, six_joint_floating_mechanism
 from yid_ocp.vision.frames import dropped_frame_error
-from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
+from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud, indices_among_kept
 
 _N_NEIGHBOURS = 10
 _MAX_LINK_SPACINGS = 3.0  # in usual spacings; points further apart are not connected
@@ -121,15 +121,8 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
         bridges.append((int(own[nearest[k]]), int(other[k])))
         joined.append(int(part[other[k]]))
     kept = np.flatnonzero(np.isin(part, joined))
-    every = _renumbered(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
+    every = indices_among_kept(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
     return points[kept], _graph(points[kept], np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0))
-
-
-def _renumbered(kept: IntArray, count: int) -> IntArray:
-    """New index of each entry among the kept ones, -1 for the others."""
-    numbers = np.full(count, -1)
-    numbers[kept] = np.arange(len(kept))
-    return numbers
 
 
 def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, IntArray]:
@@ -165,7 +158,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
             break
         edges = edges[~np.isin(edges, np.array(min(short, key=lambda found: found[0])[1][:-1])).any(axis=1)]
     used = np.unique(edges)
-    return replace(trace, nodes=nodes[used], edges=_renumbered(used, len(nodes))[edges])
+    return replace(trace, nodes=nodes[used], edges=indices_among_kept(used, len(nodes))[edges])
 
 
 def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[float, list[int]]:
