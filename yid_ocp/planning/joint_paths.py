@@ -220,7 +220,7 @@ class PathSimulator:
         """
         begin, nodes, directions = self.start_equilibrium.state, len(self.node_times), None
         if slopes:
-            by_path = np.kron(self._basis, np.eye(w.shape[1])).reshape(nodes, w.shape[1], w.size)
+            by_path = np.asarray(np.kron(self._basis, np.eye(w.shape[1])), float).reshape(nodes, w.shape[1], w.size)
             directions = SensitivityDirections((), np.zeros((len(begin), w.size)), prescribed_tangents=by_path)
         elif names:
             known, guess = self.moved_joint_start_positions, self.system_start_configuration

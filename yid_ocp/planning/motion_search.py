@@ -95,7 +95,7 @@ class PlanResidualAndLimitFunctions:
         if course is not None:
             parts.append(_rows(at[:, :3] - course, by_w[:, :3], reached))
         bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
-        parts.append(_rows(bend @ w, np.kron(bend, np.eye(w.shape[1])), _ACCELERATION_WEIGHT**-0.5))
+        parts.append(_rows(bend @ w, np.asarray(np.kron(bend, np.eye(w.shape[1])), float), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
             unit = self._effort_limit / np.sqrt(options.effort_weight)
@@ -111,8 +111,8 @@ class PlanResidualAndLimitFunctions:
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
-        one = np.eye(w.shape[1])  # the derivative of matrix @ w is a Kronecker product
-        parts: list[tuple[Array, Array | None]] = [(matrix @ w, np.kron(matrix, one)) for matrix in controls]
+        one = np.eye(w.shape[1])  # the derivative of m @ w is a Kronecker product
+        parts: list[tuple[Array, Array | None]] = [(m @ w, np.asarray(np.kron(m, one), float)) for m in controls]
         parts.append((rollout.effort[every], None if pushed is None else pushed[every]))
         if self.options.limits.max_spring_angle is not None:
             slope = None if moved is None else moved[every, self._springs]
