@@ -155,8 +155,7 @@ class SingleFrameTracker:
         """Configuration (n,) at a time of the joints' clock, with an undeformed object; constant beyond the joints."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
-            index = [self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]
-            q[index] = self.joint_angles_at(t)
+            q[self.shape_fitter.recorded_joint_indices] = self.joint_angles_at(t)
         return q
 
     def estimate_shared_values(self) -> SequenceEstimates:
