@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
 
 
 class YidError(Exception):
@@ -77,24 +76,19 @@ def failed_rollout_error(reason: str, where: str = "parameter values and initial
     return SolverError(what, where=where, allowed=allowed, hint=FAILED_ROLLOUT_ADVICE)
 
 
-_Error = TypeVar("_Error", bound=YidError)
-
-
-def missing_package_error(kind: type[_Error], what: str, extra: str, error: Exception) -> _Error:
-    """Create an error of `kind` for an `error` of an import: `what`, and how to install `extra` or a system library."""
-    where, hint = f"the Python environment {sys.prefix}", f"pip install '.[{extra}]' in the project's clone"
-    if not isinstance(error, ModuleNotFoundError):
-        what = f"{what}, which is installed but cannot be loaded: {error}"
-        hint = f"install the missing system library (libGL.so.1: apt install libgl1); if none is missing, {hint}"
-    return kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint)
-
-
 def import_optional(module: str, extra: str, what: str, kind: type[YidError] = DataError) -> ModuleType:
-    """Import and return a module of the optional dependencies `extra`. Raises `kind` with the text `what` if absent."""
+    """Import and return a module of the optional dependencies `extra`.
+
+    Raises `kind` with the text `what`, and how to install `extra` or a system library, if the import fails.
+    """
     try:
         return import_module(module)
-    except ImportError as error:
-        raise missing_package_error(kind, what, extra, error) from error
+    except (ImportError, OSError) as error:
+        where, hint = f"the Python environment {sys.prefix}", f"pip install '.[{extra}]' in the project's clone"
+        if not isinstance(error, ModuleNotFoundError):
+            what = f"{what}, which is installed but cannot be loaded: {error}"
+            hint = f"install the missing system library (libGL.so.1: apt install libgl1); if none is missing, {hint}"
+        raise kind(what, where=where, allowed=f"yid_ocp with its extra `{extra}`", hint=hint) from error
 
 
 class OutputError(YidError):

@@ -81,7 +81,7 @@ def test_slopes_are_derivatives(moved, wanted, more):
     shooting = MotionToTargetSearch([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
-    before, after, here = (shooting._residual_and_limit_values(y) for y in (x - e * way, x + e * way, x))
+    before, after, here = (shooting._residual_and_limit_values(tuple(y)) for y in (x - e * way, x + e * way, x))
     for value in (0, 2):
         slope = (after[value] - before[value]) / (2 * e)
         np.testing.assert_allclose(here[value + 1] @ way, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())

@@ -298,7 +298,7 @@ def test_an_exported_model_replays_its_commands(servo_arm: System, recording: Re
     nominal = dict(zip(servo_arm.parameters.names, servo_arm.parameters.vector(VALUES), strict=True))
 
     def error(own: Recording = recording, **changes: float) -> float:
-        text = mujoco_xml(servo_arm, nominal | changes, emulate=True, actuators=True)
+        text = mujoco_xml(servo_arm, nominal | changes, standalone=True)
         return replay_mismatch_by_channel(text, servo_arm, own)["joints.position"].rmse
 
     assert error() < 1e-3

@@ -83,9 +83,9 @@ def tracked(system, run, recording, shape):
     """
 
     def make(outliers=0.0, seed=0, late=(), **timing):
-        when = vision.VirtualCameraTiming(mean_rate=3.0, latency=0.06, **timing)
         scene = vision.SceneDescription(system, "package:baxter")
-        camera = vision.VirtualCameraSetup(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
+        sensor = replace(COARSE, outlier_probability=outliers)
+        camera = vision.VirtualCameraSetup(POSE, sensor, mean_rate=3.0, latency=0.06, seed=seed, **timing)
         made = vision.render_virtual_frames(scene, run.t, run.q, camera)
         options = vision.TrackOptions(
             calibration=vision.ArmBasedCameraCalibrationOptions(n_frames=4), tracked_points=system.point_frames

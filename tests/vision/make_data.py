@@ -30,7 +30,7 @@ def main() -> None:
     motion = random_multisine_motion(system, seed=1, excitation=MultisineOptions(gripper_travel=0.15), **start)
     run = simulate_in_mujoco(system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), **start)
     pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    camera = vision.VirtualCameraSetup(pose, timing=vision.VirtualCameraTiming(mean_rate=2.7), seed=5)
+    camera = vision.VirtualCameraSetup(pose, mean_rate=2.7, seed=5)
     made = vision.render_virtual_frames(vision.SceneDescription(system, "package:baxter"), run.t, run.q, camera)
     tree = system.mechanism_with_values()
     robot = ArticulatedSurfaces(tree, load_robot_meshes_by_joint("package:baxter", tree))

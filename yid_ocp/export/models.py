@@ -14,7 +14,7 @@ import numpy as np
 
 from yid_ocp.model.mechanism import Inertia, Joint, Mechanism, Placement, merge_inertias, rpy_from_rotation
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import mechanism_to_urdf
+from yid_ocp.model.urdf import INERTIA_TENSOR_KEYS, mechanism_to_urdf
 from yid_ocp.virtual import mjcf
 
 EXPORT_MANIFEST_FORMAT = "yid-export/1"
@@ -83,8 +83,7 @@ def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
     _sdf_pose(inertial, Placement(ca.SX(ca.DM.eye(3)), body.center_of_mass))
     _add_numbers(inertial, {"mass": float(body.mass)})
     tensor = np.array(ca.DM(body.inertia_about_com))
-    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    _add_numbers(SubElement(inertial, "inertia"), {key: tensor[at] for key, at in places.items()})
+    _add_numbers(SubElement(inertial, "inertia"), {key: tensor[at] for key, at in INERTIA_TENSOR_KEYS.items()})
 
 
 def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: mjcf.JointDynamicsTerms) -> None:

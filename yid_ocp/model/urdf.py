@@ -42,7 +42,7 @@ _MAX_NUMBER = 1e12  # in m, rad, kg and kg m^2; avoids overflow of squares
 _PRINCIPAL_MOMENT_RTOL = 1e-2  # tolerance for rounding in the file
 _PRINCIPAL_MOMENT_ATOL = 1e-12  # likewise, for point masses [kg m^2]
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
-_TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+INERTIA_TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
 _LIMITS = ("lower", "upper", "effort", "velocity")
 
@@ -240,7 +240,7 @@ def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | Non
     moments = element.find("inertia")
     tensor = np.zeros((3, 3))
     if moments is not None:
-        for key, (i, j) in _TENSOR_KEYS.items():
+        for key, (i, j) in INERTIA_TENSOR_KEYS.items():
             tensor[i, j] = tensor[j, i] = float(moments.attrib[key])
     mass = float(_part(element, "mass").attrib["value"])
     return SimpleNamespace(mass=mass, inertia=tensor, origin=_read_origin(element))
@@ -305,7 +305,7 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
                 hint = "correct the mass, or delete the <inertial>"
                 raise ModelError(f"{name} has {what}", where=where, allowed=allowed, hint=hint)
             if tensor is not None:
-                for key in _TENSOR_KEYS:
+                for key in INERTIA_TENSOR_KEYS:
                     _numbers(tensor.get(key, ""), 1, f"{name}: inertia {key}", where)
 
 
@@ -485,7 +485,7 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
             com = _digits(np.array(ca.DM(body.center_of_mass)).ravel())
             ElementTree.SubElement(inertial, "origin", xyz=com, rpy="0 0 0")
             ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
-            moments = {key: _digits([tensor[ij]]) for key, ij in _TENSOR_KEYS.items()}
+            moments = {key: _digits([tensor[ij]]) for key, ij in INERTIA_TENSOR_KEYS.items()}
             ElementTree.SubElement(inertial, "inertia", moments)
         _write_joint(robot, joint, links[joint.parent_index + 1], links[i + 1])
     for name, frame in mechanism.frames.items():

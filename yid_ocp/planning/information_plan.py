@@ -221,10 +221,8 @@ def _smooth(experiment: SplineMotionExperiment, w: Array) -> tuple[Array, Array 
 
 def _unseen(experiment: SplineMotionExperiment, told: Sequence[Array | None]) -> dict[str, float]:
     """Parameters to which no motion's measurements are sensitive, with the largest sensitivity of each [data stds]."""
-    largest = np.zeros(len(experiment.sensitivity_column_names))
-    for rows in told:
-        if rows is not None:
-            largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
+    norms = [np.linalg.norm(rows, axis=0) for rows in told if rows is not None]
+    largest = np.max([np.zeros(len(experiment.sensitivity_column_names)), *norms], axis=0)
     named = zip(experiment.sensitivity_column_names, largest, strict=True)
     hidden = {name: float(size) for name, size in named if size < _UNOBSERVABLE_STDS}
     return {name: size for name, size in hidden.items() if name.split("[")[0] in experiment.free_parameters}
@@ -312,7 +310,7 @@ def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion
         rows = experiment.planned_recording_sensitivities(found.w)
     except SolverError:
         return -math.inf
-    return criterion.value_and_gradient_wrt_sensitivities(rows, False)[0]
+    return criterion.value_and_gradient_wrt_sensitivities(rows)[0]
 
 
 def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Annotated, Literal, TypeVar
+from functools import cached_property, lru_cache
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
@@ -21,8 +21,6 @@ from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
-
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +156,7 @@ class RestToRestSplineBasis:
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
         """Return the values (N, K) of K basis functions or their `order`-th time derivatives at times `t` (N,) [s]."""
-        values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
-        return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
+        return np.asarray(self._splines(order)(np.minimum(t, self.duration)))
 
     def straight_line_coefficients(self, change: Array) -> Array:
         """Return the coefficients (K, nj) of a straight path in joint space with the total motion `change` (nj,)."""
@@ -219,23 +216,17 @@ class PathSimulator:
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
         """Simulate the path with coefficients `w` (K, nc).
 
-        The rollout has sensitivities to the parameters `names` and then, if `slopes`, to the K nc coefficients.
+        The rollout has sensitivities to the K nc coefficients if `slopes`, else to the parameters `names`.
         """
-        directions = None
-        if slopes or names:
-            size = w.size if slopes else 0
-            nodes, nc = len(self.node_times), len(self.moved_joint_indices)
-            by_path = np.zeros((nodes, nc, len(names) + size))
-            start = np.zeros((len(self.start_equilibrium.state), len(names) + size))
-            if slopes:
-                by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
-            if names:
-                known, guess = self.moved_joint_start_positions, self.system_start_configuration
-                rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
-                start[:, : len(names)] = rest.state_by_theta
-            directions = SensitivityDirections(tuple(names), start, None, by_path)
-        begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
-        return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
+        begin, nodes, directions = self.start_equilibrium.state, len(self.node_times), None
+        if slopes:
+            by_path = np.asarray(np.kron(self._basis, np.eye(w.shape[1])), float).reshape(nodes, w.shape[1], w.size)
+            directions = SensitivityDirections((), np.zeros((len(begin), w.size)), prescribed_tangents=by_path)
+        elif names:
+            known, guess = self.moved_joint_start_positions, self.system_start_configuration
+            rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
+            directions = SensitivityDirections(tuple(names), rest.state_by_theta)
+        return simulate(self.step, self.theta, begin, nodes - 1, path=self.joint_positions(w), directions=directions)
 
     def frame_positions_along_states(self, frames: FramePositionEvaluator, state: Array) -> Array:
         """Return the positions of frames along a trajectory (N, nx), shape (N, frames, 3) [m]."""
@@ -262,6 +253,7 @@ class PlannedMotion:
     rollout: Rollout
     is_successful: bool  # whether a motion within the limits reaches the goal, or the search for the best one converged
     message: str
+    target_point: str | None = field(default=None, kw_only=True)  # point that a target is for; None without a target
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -297,13 +289,9 @@ class PlannedMotion:
     def point_trajectories(self) -> dict[str, Array]:
         """The world trajectories (N + 1, 3) [m] of the system's points and of the target point, if any, by name."""
         system = self.simulator.step.system
-        names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
+        names = tuple(dict.fromkeys((*system.point_frames, *filter(None, [self.target_point]))))
         places = self.simulator.frame_positions_along_states(FramePositionEvaluator(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
-
-    @property
-    def _further_points(self) -> tuple[str, ...]:
-        return ()
 
 
 def _position_limits(system: System) -> tuple[Array, Array]:
@@ -386,8 +374,9 @@ def solve_equilibrium_at_point_target(
         raise ConfigError(what, where="plan.point", allowed=allowed, hint=hint)
     guess = [start.state[:n]]
 
-    @memoize_last_call
-    def rows(x: Array) -> tuple[Array, Array]:
+    @lru_cache(maxsize=1)
+    def rows(known: tuple[float, ...]) -> tuple[Array, Array]:
+        x = np.array(known)
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.is_converged:
             return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
@@ -399,7 +388,7 @@ def solve_equilibrium_at_point_target(
     lower, upper = _position_limits(system)
     begin = np.clip(first, lower + 1e-6, upper - 1e-6)
     found = least_squares(
-        lambda x: rows(x)[0], begin, jac=lambda x: rows(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
+        lambda x: rows(tuple(x))[0], begin, jac=lambda x: rows(tuple(x))[1], bounds=(lower, upper), max_nfev=100
     )
     rest = statics.solve(found.x, theta, guess=guess[0])
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - target)) if rest.is_converged else np.inf
@@ -415,15 +404,3 @@ def solve_equilibrium_at_point_target(
         where = f"plan.{'point_target_offset_from_start' if options.target_position is None else 'target_position'}"
         raise ConfigError(what, where=where, allowed="a position at which the point can rest", hint=hint)
     return rest
-
-
-def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """Wrap a function so that a second call with the same argument returns the value of the first call."""
-    last: list[tuple[Array, _Value]] = []
-
-    def at(x: Array) -> _Value:
-        if not last or not np.array_equal(last[-1][0], x):
-            last[:] = [(np.array(x), function(x))]
-        return last[-1][1]
-
-    return at

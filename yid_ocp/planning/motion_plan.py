@@ -49,17 +49,12 @@ class TargetMotionPlan(PlannedMotion):
     The time step of its simulation is shorter than that of the planner's argument `step` if accuracy required halving.
     """
 
-    target_point: str
     target_position: Array  # (3,) [m]
     max_position_error: float  # largest distance of the point from its target during the final standstill [m]
     max_residual_speed: float  # largest speed of a point of the object in that time [m/s]
     max_path_deviation: float | None  # largest distance from the reference path [m]; None without one
     end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
     n_evaluations: int  # motions that the search simulated with derivatives
-
-    @property
-    def _further_points(self) -> tuple[str, ...]:
-        return (self.target_point,)
 
 
 def plan_motion_to_target(
@@ -95,17 +90,16 @@ def plan_motion_to_target(
     end = solve_equilibrium_at_point_target(step, values, start, point, place, options)
     check_rest_effort_and_spring_limits(step, values, end, options.limits, "where it ends")
     joints = [system.mechanism.joints[i] for i in mover.moved_joint_indices]
-    travel = np.abs(end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions)
-    least = travel / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
+    travel = end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions
+    least = np.abs(travel) / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
     if options.duration < (shortest := float(least.max())):
-        name, turn = joints[int(least.argmax())].name, travel[int(least.argmax())]
+        name, turn = joints[int(least.argmax())].name, abs(travel[int(least.argmax())])
         what = f"joint {name} would move by {turn:.3g} rad or m in {options.duration:g} s, faster than its speed limit"
         hint = "set a longer plan.duration, or a target nearer to the start"
         raise ConfigError(what, where="plan.duration", allowed=f"at least {shortest:.3g} s", hint=hint)
 
     def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
-        travel = end.state[own.moved_joint_indices] - own.moved_joint_start_positions
         straight = own.path.straight_line_coefficients(travel)
         rows = PlanResidualAndLimitFunctions(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
@@ -244,7 +238,7 @@ def _point_slopes(rows: PlanResidualAndLimitFunctions, w: Array, known: Paramete
     rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
     _, by_q = rows.point.positions_and_jacobian(rollout.state[end, :n], mover.theta)
-    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, : len(known.parameter_names)])
+    return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n])
 
 
 def _outcome(
@@ -279,7 +273,8 @@ def _outcome(
         message += "Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
-    return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
+    point = rows.point.names[0]
+    return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.target, *errors, target_point=point)
 
 
 def _shortest(

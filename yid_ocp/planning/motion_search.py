@@ -24,7 +24,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions, memoize_last_call
+from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions
 from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 
 _LIMIT_NODE_STRIDE = 2  # node spacing at which limits on free coordinates are evaluated
@@ -86,7 +86,7 @@ class PlanResidualAndLimitFunctions:
         assert rollout.state_sensitivity is not None
         assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
-        by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
+        by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n])
         end, course = mover.node_indices_after_motion, self.desired_point_trajectory
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
@@ -95,13 +95,11 @@ class PlanResidualAndLimitFunctions:
         if course is not None:
             parts.append(_rows(at[:, :3] - course, by_w[:, :3], reached))
         bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
-        parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
+        parts.append(_rows(bend @ w, np.asarray(np.kron(bend, np.eye(w.shape[1])), float), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
-            finite = np.isfinite(self._effort_limit)
-            unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
-            by_effort = rollout.effort_sensitivity[:, finite, -size:] / unit[:, None]
-            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
+            unit = self._effort_limit / np.sqrt(options.effort_weight)
+            parts.append(_rows(rollout.effort / unit, rollout.effort_sensitivity / unit[:, None], 1.0))
         return parts
 
     def constraints_and_jacobian(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
@@ -113,15 +111,15 @@ class PlanResidualAndLimitFunctions:
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
         controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
-        parts: list[tuple[Array, Array | None]] = [(matrix @ w, _by_coefficients(matrix, w)) for matrix in controls]
-        finite = np.isfinite(self._effort_limit)
-        parts.append((rollout.effort[every, finite], None if pushed is None else pushed[every, finite, -size:]))
+        one = np.eye(w.shape[1])  # the derivative of m @ w is a Kronecker product
+        parts: list[tuple[Array, Array | None]] = [(m @ w, np.asarray(np.kron(m, one), float)) for m in controls]
+        parts.append((rollout.effort[every], None if pushed is None else pushed[every]))
         if self.options.limits.max_spring_angle is not None:
-            slope = None if moved is None else moved[every, self._springs, -size:]
+            slope = None if moved is None else moved[every, self._springs]
             parts.append((rollout.state[every, self._springs], slope))
         if self.inside is not None:
             at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
-            parts.append((at, None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])))
+            parts.append((at, None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n])))
         value = np.concatenate([rows.ravel() for rows, _ in parts])
         slopes = [slope.reshape(-1, size) for _, slope in parts if slope is not None]
         return value, np.vstack(slopes) if len(slopes) == len(parts) else None
@@ -134,10 +132,8 @@ class PlanResidualAndLimitFunctions:
         count = len(mover.path.coefficients_to_control_points_matrix())
         found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
         found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
-        finite = np.isfinite(self._effort_limit)
         steps = len(range(0, len(mover.node_times) - 1, _LIMIT_NODE_STRIDE))
-        able = tuple(name for name, one in zip(names, finite, strict=True) if one)
-        found.append(_even("effort [N m or N]", able, self._effort_limit[finite], steps))
+        found.append(_even("effort [N m or N]", names, self._effort_limit, steps))
         nodes = len(range(0, len(mover.node_times), _LIMIT_NODE_STRIDE))
         if limits.max_spring_angle is not None:
             springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
@@ -163,11 +159,6 @@ class PlanResidualAndLimitFunctions:
                 bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
                 found[rows.description] = (rows.row_names[worst], float(own[worst]), float(bound))
         return found
-
-
-def _by_coefficients(matrix: Array, w: Array) -> Array:
-    """Derivative of `matrix @ w` by the coefficients, row by row."""
-    return np.einsum("tk,ji->tjki", matrix, np.eye(w.shape[1])).reshape(-1, w.size)
 
 
 def _rows(value: Array, slope: Array, unit: float) -> tuple[Array, Array]:
@@ -202,14 +193,12 @@ class MotionToTargetSearch:
 
     def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
-        self._residual_and_limit_values = memoize_last_call(self._evaluated)
+        self._residual_and_limit_values = functools.lru_cache(maxsize=1)(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
-        self.evaluations = 0
 
-    def _evaluated(self, x: Array) -> tuple[Array, Array, Array, Array]:
+    def _evaluated(self, x: tuple[float, ...]) -> tuple[Array, Array, Array, Array]:
         """Residual, scaled limit values and the Jacobians of both; not finite if a rollout fails."""
-        self.evaluations += 1
-        w = x.reshape(self._shape)
+        w = np.reshape(x, self._shape)
         rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
         pairs = zip(self._cases, rollouts, strict=True)
         parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
@@ -233,7 +222,7 @@ class MotionToTargetSearch:
             stop = {"max_nfev": iterations, "ftol": 1e-6, "xtol": 1e-7, "gtol": 1e-8}
             found = least_squares(value, x, jac=slope, bounds=(low, high), x_scale=1.0, **stop)
             x, ended = found.x, found.status > 0
-            reached = self._residual_and_limit_values(x)[2]
+            reached = self._residual_and_limit_values(tuple(x))[2]
             over = np.vstack([reached - self._upper, self._lower - reached])
             passed = float(np.max(over, initial=0.0))
             if passed <= _LIMIT_TOLERANCE or not np.isfinite(passed):
@@ -246,11 +235,12 @@ class MotionToTargetSearch:
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
-        return MotionToTargetResult(x.reshape(self._shape), finished, message, self.evaluations)
+        evaluations = self._residual_and_limit_values.cache_info().misses
+        return MotionToTargetResult(x.reshape(self._shape), finished, message, evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
-        residual, by_x, limited, limits_by_x = self._residual_and_limit_values(x)
+        residual, by_x, limited, limits_by_x = self._residual_and_limit_values(tuple(x))
         root = np.sqrt(penalty)
         # cost plus one: the search ends if the cost falls by little compared with a reached target
         values, slopes = [np.ones(1), residual], [np.zeros((1, len(x))), by_x]
@@ -282,17 +272,14 @@ class DOptimalityCriterion:
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
-    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
+    def value_and_gradient_wrt_sensitivities(self, rows: Array) -> tuple[float, Array]:
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
         own = whole[np.ix_(chosen, chosen)]
-        found = -0.5 * float(np.linalg.slogdet(own)[1])
-        if not slope:
-            return found, np.zeros((0, 0))
         wide = whole[:, chosen]  # d C = -C d(J'J) C
-        return found, rows @ (wide @ np.linalg.solve(own, wide.T))
+        return -0.5 * float(np.linalg.slogdet(own)[1]), rows @ (wide @ np.linalg.solve(own, wide.T))
 
 
 @dataclass(frozen=True)
@@ -315,18 +302,17 @@ class EffectDiscriminationCriterion:
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
-    def value_and_gradient_wrt_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`, empty without `slope`."""
+    def value_and_gradient_wrt_sensitivities(self, rows: Array) -> tuple[float, Array]:
+        """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
             weight = 1.0 / (1.0 + square)
             total += weight
-            if slope:
-                factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
-                by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
-                by_rows[:, others] -= factor * rest @ used.T
-        return -0.5 * float(np.log(total)), 0.5 * by_rows / total if slope else np.zeros((0, 0))
+            factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
+            by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
+            by_rows[:, others] -= factor * rest @ used.T
+        return -0.5 * float(np.log(total)), 0.5 * by_rows / total
 
     def _apart(self, rows: Array, i: int, j: int) -> tuple[float, Array, list[int], Array]:
         """Squared distance, unexplained change by effect i, and columns and coefficients that imitate it."""
@@ -392,7 +378,7 @@ class InformativeMotionSearch:
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; the criterion is minus infinity if the rollout fails."""
         rows = self.experiment.sensitivities_to_unknowns(w)
-        return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows, False)[0], rows
+        return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
         """Maximise the criterion in at most `rounds` rounds from coefficients `start` (K, nc) within the limits."""

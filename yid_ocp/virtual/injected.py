@@ -249,30 +249,23 @@ def _held_friction(scene: _EffectContext, model: Any, effects: Sequence[Injected
 
     This torque is tau_c + tau_s exp(-(v/v_stribeck)^2) + share |load|, with the torque through the gear as load.
     """
-    names = list(dict.fromkeys(effect.location for effect in effects))
-    at = np.array([model.joint(name).id for name in names])
-    sizes = {key: np.zeros(len(names)) for key in ("tau_c", "tau_s", "share")}
-    speeds = np.ones(len(names))
-    for effect in effects:
-        for key, value in effect.values.items():
-            if key in sizes:
-                sizes[key][names.index(effect.location)] += value
-            elif key == "v_stribeck":
-                speeds[names.index(effect.location)] = value
+    at = np.array([model.joint(effect.location).id for effect in effects])
+    tau_c, tau_s, share = (np.array([e.values.get(key, 0.0) for e in effects]) for key in ("tau_c", "tau_s", "share"))
+    speeds = np.array([effect.values.get("v_stribeck", 1.0) for effect in effects])
     # as stiff as the inner step allows
     model.dof_frictionloss[at] = _NO_FRICTION
     model.dof_solref[at, 0], model.dof_solimp[at, :2] = _FRICTION_TIME_STEPS * model.opt.timestep, 0.999
-    gear_load = _gear_load(scene, model, at) if np.any(sizes["share"]) else None
+    gear_load = _gear_load(scene, model, at) if np.any(share) else None
     apart = int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
 
     def hold(model: Any, data: Any) -> None:
         # the controller's model has no grasps and no friction
         if model.opt.disableflags & apart or not scene.has_motion_begun:
             return
-        size = sizes["tau_c"] + sizes["tau_s"] * np.exp(-((data.qvel[at] / speeds) ** 2))
+        size = tau_c + tau_s * np.exp(-((data.qvel[at] / speeds) ** 2))
         if gear_load is not None:
-            size += sizes["share"] * np.abs(gear_load(data))
-        model.dof_frictionloss[at] = np.maximum(size, _NO_FRICTION)
+            size += share * np.abs(gear_load(data))
+        model.dof_frictionloss[at] = np.maximum(np.bincount(at, size)[at], _NO_FRICTION)
 
     return hold
 

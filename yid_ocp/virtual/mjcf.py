@@ -10,6 +10,7 @@ import functools
 import logging
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, ModelError, import_optional
+from yid_ocp.errors import ModelError, import_optional
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, depends_on_symbols, merge_inertias
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
@@ -34,9 +35,7 @@ _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of fric
 _N_COMPARED_STATES = 3  # number of random states at which an effect's equations are compared with joint terms
 _ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
-# aspects of sensors and recorded torques, which do not enter the mechanics
-_IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
-_NON_NATIVE_ASPECTS = MUJOCO_APPROXIMATED_ASPECTS | _IGNORED_ASPECTS | {"servo_firmware", "clock", "memory", "force"}
+_INEXPRESSIBLE_ASPECTS = frozenset({"servo_firmware", "clock", "memory", "force"})  # of the mechanics
 
 _JOINTS_PER_BODY = 6  # MuJoCo's limit
 _ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as small as stability at a stop allows
@@ -149,26 +148,22 @@ def effect_joint_terms_and_changed_aspects(
 
 def system_joint_dynamics_terms(system: System, value: CasadiEvaluator) -> dict[str, JointDynamicsTerms]:
     """Return the springs, dampers, rotor inertia and friction of each joint, from description and joint effects."""
-    found: dict[str, JointDynamicsTerms] = {}
-
-    def add(joint: str, own: JointDynamicsTerms) -> None:
-        found[joint] = found.get(joint, JointDynamicsTerms()) + own
-
+    found = defaultdict[str, JointDynamicsTerms](JointDynamicsTerms)
     for joint, coefficient in system.joint_damping.items():
-        add(joint, JointDynamicsTerms(damping=float(value(coefficient)[0])))
+        found[joint] += JointDynamicsTerms(damping=float(value(coefficient)[0]))
     for joint, servo in system.servos.items():
         if servo.motor_kind == "dc":  # the limit of its duty cycle does not limit the counter-voltage
-            add(joint, JointDynamicsTerms(damping=float(value(servo.damping)[0])))
+            found[joint] += JointDynamicsTerms(damping=float(value(servo.damping)[0]))
     for spring in system.elastic_joints:
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
-        add(spring.joint_name, JointDynamicsTerms(stiffness, stiffness * rest, damping=damping))
+        found[spring.joint_name] += JointDynamicsTerms(stiffness, stiffness * rest, damping=damping)
     for joint, compliance in system.joint_compliances.items():
         if not value._is_zero_at_parameter_values(compliance):
-            stiffness = 1 / float(value(compliance)[0])
-            add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
+            stiffness, relaxation = 1 / float(value(compliance)[0]), system.joint_relaxation_times.get(joint, 0.0)
+            found[joint] += JointDynamicsTerms(stiffness, damping=relaxation * stiffness)
     for effect in (own for own in system.effects if not value.is_effect_neutral(own)):
         for joint, own in effect_joint_terms_and_changed_aspects(system, effect, value)[0].items():
-            add(joint, own)
+            found[joint] += own
     return found
 
 
@@ -208,23 +203,19 @@ def _joint_terms(system: System, effect: Effect, value: CasadiEvaluator) -> dict
     momentum = ca.gradient(energy, v)
     if depends_on_symbols(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
         return None
-    ones = ca.SX.ones(n)
-    by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
-    second = ca.jtimes(ca.diag(by_q), q, ones)
-    slopes = [ca.diag(by_v), ca.diag(inertia), ca.jtimes(second, q, ones)]
-    mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
-    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
-    rng = np.random.default_rng(0)
-    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_N_COMPARED_STATES)]
-    rest = [np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n))[:6]]
-    pull, slope, curve, damping, armature, twisted = rest
-    scale = _ROUNDING_TOLERANCE * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
-    moved = [np.abs(entry[i].ravel() - rest[i]).max() for entry in found for i in range(3, 3 + len(slopes))]
-    constant = all(size <= scale for size in moved)
-    apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
-    springs = np.abs(curve).max() <= scale and damping.max() <= scale and armature.min() >= -scale
+    by_q, ones = ca.diag(ca.jacobian(force, q)), ca.SX.ones(n)
+    third = ca.jtimes(ca.jtimes(by_q, q, ones), q, ones)
+    slopes = by_q, third, ca.diag(ca.jacobian(force, v)), ca.diag(ca.jacobian(momentum, v))
+    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, momentum, *slopes)])
+    pull, _, *rest = (np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n)))
+    slope, twisted, damping, armature = rest
+    scale = _ROUNDING_TOLERANCE * max(1.0, float(np.abs([pull, *rest]).max()))
+    for x, rate in np.random.default_rng(0).uniform(-1.0, 1.0, (_N_COMPARED_STATES, 2, n)):
+        likely = [pull + slope * x + twisted / 6 * x**3 + damping * rate, armature * rate]
+        if not np.abs(np.squeeze(at(x, rate)[:2], 2) - likely).max() <= scale:  # also if it is not a number
+            return None
     loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is not a spring
-    if not (constant and apart and springs) or np.any(loose):
+    if damping.max() > scale or armature.min() < -scale or np.any(loose):
         return None
     return {
         joint: JointDynamicsTerms(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
@@ -238,8 +229,7 @@ def mujoco_xml(
     values: Mapping[str, float] | None = None,
     *,
     time_step: float = 5e-4,
-    emulate: bool = False,
-    actuators: bool = False,
+    standalone: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
     """Return a system as a MuJoCo model in MJCF, an XML text.
@@ -253,22 +243,18 @@ def mujoco_xml(
     ----------
     time_step : float
         Time step of the simulator [s]. Grasps are constraints with a time constant of two steps.
-    emulate : bool
-        Whether approximations are allowed: sticking for smoothed dry friction, a tendon for a compliant point grasp.
-        Otherwise a system that needs them raises an error.
-    actuators : bool
-        Whether each driven joint has an actuator of its name, whose control is the recorded torque, and whose gain,
-        offset, delay and lag give the applied torque. Without actuators, apply true torques as `qfrc_applied`. A servo
-        always is an actuator, whose control is the command.
+    standalone : bool
+        Whether the model is for use without this package. Approximations are then allowed: sticking for smoothed dry
+        friction, a tendon for a compliant point grasp. Otherwise a system that needs them raises an error. Each driven
+        joint then has an actuator of its name, whose control is the recorded torque, and whose gain, offset, delay and
+        lag give the applied torque. Otherwise, apply true torques as `qfrc_applied`. A servo always is an actuator,
+        whose control is the command.
     gear_play : mapping of joint name to float, optional
         Full backlash width of gears [rad]. The joint is then the motor side, followed by a joint `NAME_play`.
     """
-    if not time_step > 0:
-        what, hint = f"time_step is {time_step}, but must be above 0", "pass for example time_step=0.0005"
-        raise ConfigError(what, where="mujoco_xml", allowed="a number above 0 [s]", hint=hint)
     tree, weights = _weighed(system.mechanism_with_values(values))
     value = CasadiEvaluator(system, values)
-    _refuse_inexpressible(system, value, emulate)
+    _refuse_inexpressible(system, value, standalone)
 
     root = Element("mujoco", model=tree.name)
     SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
@@ -288,7 +274,7 @@ def mujoco_xml(
     for name, frame in sites:
         SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
-    if actuators or system.servos:
+    if standalone or system.servos:
         _add_actuators(system, value, SubElement(root, "actuator"), time_step)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -437,20 +423,19 @@ def mujoco_model_from_mjcf_text(text: str) -> Any:
         raise ModelError(what, where="MJCF text", allowed="MJCF that MuJoCo compiles", hint=hint) from error
 
 
-def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool) -> None:
-    native = elements_by_aspect_and_file_format().keys() - _NON_NATIVE_ASPECTS  # MuJoCo has an equivalent term
-    able = native | MUJOCO_APPROXIMATED_ASPECTS if emulate else native
+def _refuse_inexpressible(system: System, value: CasadiEvaluator, standalone: bool) -> None:
+    lacking = _INEXPRESSIBLE_ASPECTS if standalone else _INEXPRESSIBLE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS
     for effect in system.effects:
-        if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS:
+        if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] & lacking:
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
             where, allowed = f"effect '{effect.kind}@{effect.location}'", "effects that docs/howto/export.md lists"
             hint = "leave the effect out of model.effects or model.friction"
             raise ModelError(what, where=where, allowed=allowed, hint=hint)
     for grasp in system.grasps:
-        if not value._is_zero_at_parameter_values(grasp.compliance) and not (emulate and grasp.kind == "point"):
-            allowed = "rigid grasps" if not emulate else "rigid grasps, or compliant grasps of the kind point"
-            what = f"MuJoCo has no {'exact ' * (not emulate)}term for a compliant grasp of the kind {grasp.kind}"
+        if not value._is_zero_at_parameter_values(grasp.compliance) and not (standalone and grasp.kind == "point"):
+            allowed = "rigid grasps" if not standalone else "rigid grasps, or compliant grasps of the kind point"
+            what = f"MuJoCo has no {'exact ' * (not standalone)}term for a compliant grasp of the kind {grasp.kind}"
             hint = f"leave out the effect grasp_compliance@{grasp.name}"
             raise ModelError(what, where=f"grasp '{grasp.name}'", allowed=allowed, hint=hint)
     for joint, compliance in system.joint_compliances.items():
@@ -462,9 +447,6 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, emulate: bool)
         if not value._is_zero_at_parameter_values(servo.dead_band):
             key, what = f"parameters.{joint}.servo_dead_band.initial", f"servo '{joint}' has a dead band, MuJoCo none"
             raise ModelError(what, where=key, allowed="0", hint=f"add --set {key}=0")
-    if not value._is_zero_at_parameter_values(system.recorded_time_scale - 1):
-        what, hint = "an effect scales the recorded time, which MuJoCo lacks", "leave out the effect clock_scale"
-        raise ModelError(what, where="model.effects", allowed="a time scale of 1", hint=hint)
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

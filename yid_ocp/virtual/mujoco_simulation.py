@@ -155,10 +155,7 @@ def simulate_in_mujoco(
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
-        lacking = ", ".join(name for name in system.driven if name not in motion.joints)
-        what = (
-            f"the motion lacks the driven joints {lacking}" if lacking else f"the motion has {', '.join(motion.joints)}"
-        )
+        what = f"the motion has {', '.join(motion.joints) or 'no joints'}"
         what = f"{', '.join(system.prescribed)} are prescribed, not driven joints" if system.prescribed else what
         allowed = f"a motion of {', '.join(system.driven) or 'driven joints'} in this order, and no prescribed joint"
         hint = "make the motion for `system.driven`, of a system with model.arms.mode: driven or servo"
@@ -413,7 +410,7 @@ def replay_mismatch_by_channel(
 ) -> dict[str, ReplayErrorAgainstRecording]:
     """Replay a recording in MuJoCo and return the errors of the replay by channel. `text` is the model in MJCF.
 
-    `text` comes from `mujoco_xml` with actuators. Position servos get their recorded commands only. Other joints follow
+    `text` comes from `mujoco_xml`, `standalone`. Position servos get their recorded commands only. Other joints follow
     the recorded angles, and the torque that this requires is compared with the recorded torque.
 
     Keys: `joints.position` (all position servos) [rad] or `joints.effort` (all other moved joints) [N m], and

@@ -15,6 +15,5 @@ from yid_ocp.vision.surface_meshes import DepthCameraModel as DepthCameraModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.surface_meshes import SceneDescription as SceneDescription
 from yid_ocp.vision.surface_meshes import VirtualCameraSetup as VirtualCameraSetup
-from yid_ocp.vision.surface_meshes import VirtualCameraTiming as VirtualCameraTiming
 from yid_ocp.vision.surface_meshes import render_virtual_frames as render_virtual_frames
 from yid_ocp.vision.track_result import TrackResult as TrackResult

@@ -96,9 +96,7 @@ class CameraState:
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
         result = np.zeros((len(points), 3, CLOCK_OFFSET_INDEX))
-        result[:, 0, 1], result[:, 0, 2] = away[:, 2], -away[:, 1]
-        result[:, 1, 0], result[:, 1, 2] = -away[:, 2], away[:, 0]
-        result[:, 2, 0], result[:, 2, 1] = away[:, 1], -away[:, 0]
+        result[:, :, ROTATION_SLICE] = np.cross(np.eye(3), away[:, None]).transpose(0, 2, 1)
         result[:, :, TRANSLATION_SLICE] = np.eye(3)
         result[:, :, DEPTH_SCALE_INDEX] = away
         result[:, :, DEPTH_OFFSET_INDEX] = away / ahead[:, None]

@@ -79,6 +79,7 @@ class ShapeFitter:
         self._free_joint_segments = (*(owner.get(entry.joint_name, "") for entry in bends), *[""] * len(loose))
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in system.mechanism.joint_names if name not in sought)
+        self.recorded_joint_indices = [system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         self._symbolic = _symbolic_functions(system, self.free_joints)
         self._set_values(values)
 
@@ -127,15 +128,10 @@ class ShapeFitter:
         """Fit the object's shape in one frame, given the robot's configuration `q_known` (n,).
 
         The fit has two stages. Cheap passes on skeleton nodes run from every guess in `starts` (default: the undeformed
-        shape). Passes on points run from the best result. Raises `DataError` if the filtered `cloud` has no points.
+        shape). Passes on points run from the best result. The filtered `cloud` has points and nodes of their skeleton.
         """
-        if not len(cloud.points) or not len(cloud.skeleton_nodes):
-            what = f"the filtered cloud has no {'skeleton nodes' if len(cloud.points) else 'points'}"
-            hint = "pass a cloud with points; if filters removed them, loosen track.options.filters"
-            raise DataError(what, where="cloud", allowed="points and skeleton_nodes of shape (n, 3), n >= 1", hint=hint)
         free, q = list(self.free_joints), self.rest_configuration.copy()
-        known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
-        q[known] = q_known[known]
+        q[self.recorded_joint_indices] = q_known[self.recorded_joint_indices]
         begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]
         everything = np.ones(len(cloud.skeleton_nodes), bool), np.ones(len(cloud.points), bool)
         thin = shape_evidence.tube_like_node_and_point_masks(cloud, float(self.link_radii.max()))

@@ -220,10 +220,6 @@ def read_frame_folder(
     folder's values. Raises `DataError` if an entry is missing or invalid.
     """
     path = Path(folder)
-    if not path.is_dir():
-        what = "a file stands where a folder is needed" if path.exists() else "the folder of frames does not exist"
-        allowed, hint = f"a folder with {STAMP_FILE} and clouds or depth images", "pass the path of such a folder"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint)
     head, where = _read_camera(path / _CAMERA_FILE), str(path / _CAMERA_FILE)
     camera = frames.validated_camera_pose(head.get("pose") if pose is None else pose, where)
     scale = metres_per_named_unit(str(unit or head.get("unit", "m")), where)

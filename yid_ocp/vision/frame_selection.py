@@ -249,10 +249,10 @@ def choose_root_end_of_frames(frames: Sequence[FrameReport], options: TrackOptio
         said = "follows from the object's lengths and branches" if options.approximate_root_position is None else near
         return _fixed(frames, options), f"The object's first end (root) {said}"
     made, last = list(frames), None
-    for k in fitted:
-        other_fit = made[k].alternative_fit
-        if other_fit is not None and last is not None and _apart(other_fit, last) < _apart(made[k].shape_fit, last):
-            made[k] = _exchanged(made[k])
+    for k, fit in fitted.items():
+        other_fit = frames[k].alternative_fit
+        if other_fit is not None and last is not None and _apart(other_fit, last) < _apart(fit, last):
+            made[k] = _exchanged(frames[k])
         last = made[k].shape_fit
     roots, tips = _ends(made[k].shape_fit for k in two)
     moving = [float(np.median(np.linalg.norm(ends - np.median(ends, axis=0), axis=1))) for ends in (roots, tips)]
@@ -278,9 +278,7 @@ def _exchanged(frame: FrameReport) -> FrameReport:
     return replace(frame, shape_fit=frame.alternative_fit, alternative_fit=frame.shape_fit)
 
 
-def _apart(one: FrameShapeFit | None, other: FrameShapeFit | None) -> float:
-    assert one is not None
-    assert other is not None
+def _apart(one: FrameShapeFit, other: FrameShapeFit) -> float:
     return float(np.linalg.norm(one.link_ends - other.link_ends, axis=2).mean())
 
 

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.errors import DataError, missing_package_error, unknown_name_error_arguments
+from yid_ocp.errors import DataError, import_optional, unknown_name_error_arguments
 from yid_ocp.model.mechanism import homogeneous_transform
 
 PointColourArray = NDArray[np.uint8]
@@ -152,11 +152,7 @@ def import_open3d() -> ModuleType:
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise missing_package_error(DataError, "vision needs the package open3d", "vision", error) from error
-    return open3d
+    return import_optional("open3d", "vision", "vision needs the package open3d")
 
 
 @dataclass(frozen=True, eq=False)

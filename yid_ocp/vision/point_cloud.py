@@ -161,8 +161,6 @@ def _square_distances(points: Array, place: Array) -> Array:
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
     """Return the mean of the points (N, 3) in each voxel of edge `size` [m], weighted by the number of these points."""
-    if not len(points):
-        return WeightedCloud(np.empty((0, 3)), np.empty(0))
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)
     extent = cell.max(0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
@@ -226,7 +224,6 @@ class CloudSkeleton:
     nodes: Array  # (K, 3), centroids of the kept segments, in order of extraction [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
     edges: IntArray  # (E, 2), minimum spanning forest of the nodes' nearest-neighbour graph
-    component_of_node: IntArray  # (K,), connected part of each node, largest part first
 
 
 def _thin_to_nodes(
@@ -269,10 +266,7 @@ def _near(points: Array, centre: Array, neighbour_radius: float) -> IntArray:
 
 def _spanning_forest(nodes: Array) -> tuple[IntArray, IntArray]:
     """Edges (E, 2) of the shortest forest that connects near nodes, and the connected part (K,) of each node."""
-    count = len(nodes)
-    if count < 2:
-        return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
-    k = min(_NODE_NEIGHBOURS + 1, count)
+    count, k = len(nodes), _NODE_NEIGHBOURS + 1
     distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=MAX_EDGE_LENGTH)
     rows = np.repeat(np.arange(count), k)
     columns, lengths = index.ravel(), distance.ravel()
@@ -292,12 +286,14 @@ def extract_skeleton_graph(cloud: WeightedCloud, rng: np.random.Generator, diame
     neighbour_radius = max(_MIN_NEIGHBOUR_RADIUS, _NEIGHBOUR_RADIUS_IN_DIAMETERS * diameter)
     nodes, size, label = _thin_to_nodes(cloud, rng, neighbour_radius)
     edges, part = _spanning_forest(nodes)
-    if not len(nodes):
-        return CloudSkeleton(nodes, label, edges, part)
     held = np.bincount(part, size)
-    rank = np.argsort(np.argsort(-held, kind="stable"))
     keep = held[part] >= _MIN_COMPONENT_FRACTION * size.sum()
-    renamed = np.full(len(nodes) + 1, -1)
-    renamed[:-1][keep] = np.arange(int(keep.sum()))
-    edges, _ = _spanning_forest(nodes[keep])
-    return CloudSkeleton(nodes[keep], renamed[label], edges, rank[part[keep]])
+    renamed = indices_among_kept(np.flatnonzero(keep), len(nodes) + 1)  # the last entry is that of points without node
+    return CloudSkeleton(nodes[keep], renamed[label], renamed[edges[keep[edges[:, 0]]]])
+
+
+def indices_among_kept(kept: IntArray, count: int) -> IntArray:
+    """Return the index of each of `count` entries among the entries `kept`, -1 for the others."""
+    numbers = np.full(count, -1)
+    numbers[kept] = np.arange(len(kept))
+    return numbers

@@ -50,8 +50,6 @@ class BackgroundPoints:
 
     def near_background_mask(self, points: Array, beyond: float = 0.0) -> BoolArray:
         """Check which points (N, 3) lie within `match_distance + beyond` [m] of the background, (N,)."""
-        if not len(self.points) or not len(points):
-            return np.zeros(len(points), bool)
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
 
     @staticmethod
@@ -262,7 +260,6 @@ def estimate_and_check_tube_dimensions(
     nothing = TubeDimensionEstimates(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
-    covariance, frames = nothing.covariance, 0
     for turn in range(_MAX_DIMENSION_ITERATIONS):
         fits = fitted(_changed(system, given, change), starts)
         chosen = _believed(fits)

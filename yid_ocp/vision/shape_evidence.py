@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
-from yid_ocp.vision.point_cloud import MAD_TO_STD, weighted_median
+from yid_ocp.vision.point_cloud import MAD_TO_STD, indices_among_kept, weighted_median
 from yid_ocp.vision.shape_guesses import ObservedObjectEnd
 
 _HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
@@ -223,16 +223,13 @@ def tube_like_node_and_point_masks(cloud: ProcessedFrameCloud, radius: float) ->
 def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:
     """Index (N,) of the large connected part of each chosen point, 0 for the largest part; -1 for all other points."""
     part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
-    if not len(index):
-        return part
     pairs = cKDTree(tree.data[index]).query_pairs(within, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(index),) * 2)
     owner = connected_components(graph, directed=False)[1]
     count = np.bincount(owner)
-    order, number = np.argsort(-count, kind="stable"), np.full(len(count), -1)
+    order = np.argsort(-count, kind="stable")
     kept = order[count[order] >= max(least, _MIN_THING_POINTS)]
-    number[kept] = np.arange(len(kept))
-    part[index] = number[owner]
+    part[index] = indices_among_kept(kept, len(count))[owner]
     return part
 
 
@@ -241,8 +238,6 @@ def _contacts(
 ) -> BoolArray:
     """Mask of the shape's points that touch foreign points: these are at least half as dense within `within` [m]."""
     contact = np.zeros(len(shape), bool)
-    if not foreign.any():
-        return contact
     close = cKDTree(seen.points[foreign]).query(seen.points[shape], distance_upper_bound=within)[0]
     for i in np.flatnonzero(shape)[np.isfinite(close)]:
         around = np.asarray(tree.query_ball_point(seen.points[i], within), dtype=np.int64)

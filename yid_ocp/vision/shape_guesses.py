@@ -24,11 +24,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.integrator.interpreted import dense_function_evaluator
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, six_joint_floating_mechanism
 from yid_ocp.vision.frames import dropped_frame_error
-from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
+from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud, indices_among_kept
 
 _N_NEIGHBOURS = 10
 _MAX_LINK_SPACINGS = 3.0  # in usual spacings; points further apart are not connected
@@ -51,8 +52,7 @@ class _Centerline:
     @property
     def to_skeleton(self) -> CloudSkeleton:
         """Skeleton with the same nodes and edges, without points."""
-        none = np.empty(0, dtype=np.int64)
-        return CloudSkeleton(self.nodes, none, self.edges, np.zeros(len(self.nodes), dtype=np.int64))
+        return CloudSkeleton(self.nodes, np.empty(0, dtype=np.int64), self.edges)
 
     def outward_direction(self, end: int) -> Array:
         """Unit vector (3,) along the object at one of its ends, away from it."""
@@ -121,15 +121,8 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
         bridges.append((int(own[nearest[k]]), int(other[k])))
         joined.append(int(part[other[k]]))
     kept = np.flatnonzero(np.isin(part, joined))
-    every = _renumbered(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
+    every = indices_among_kept(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
     return points[kept], _graph(points[kept], np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0))
-
-
-def _renumbered(kept: IntArray, count: int) -> IntArray:
-    """New index of each entry among the kept ones, -1 for the others."""
-    numbers = np.full(count, -1)
-    numbers[kept] = np.arange(len(kept))
-    return numbers
 
 
 def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, IntArray]:
@@ -146,8 +139,6 @@ def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, 
 
 def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
     """Shortest edges that connect all nodes, and positions of omitted edges that close loops over `loop` [m]."""
-    if not len(edges):
-        return edges, np.empty((0, 3))
     forest = minimum_spanning_tree(_graph(nodes, edges)).tocoo()
     tree = np.column_stack([forest.row, forest.col]).astype(np.int64)
     one, other = edges.T
@@ -167,7 +158,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
             break
         edges = edges[~np.isin(edges, np.array(min(short, key=lambda found: found[0])[1][:-1])).any(axis=1)]
     used = np.unique(edges)
-    return replace(trace, nodes=nodes[used], edges=_renumbered(used, len(nodes))[edges])
+    return replace(trace, nodes=nodes[used], edges=indices_among_kept(used, len(nodes))[edges])
 
 
 def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[float, list[int]]:
@@ -222,7 +213,7 @@ class _Link(NamedTuple):
     joints: tuple[int, ...]
     begin: float
     end: float
-    tip: int = -1
+    tip: int
 
 
 class ShapeGuessFinder:
@@ -233,32 +224,24 @@ class ShapeGuessFinder:
     ) -> None:
         self._rest, self._bends = rest, frozenset(bends)
         self._root = [tree.joint_index(name) for name in six_joint_floating_mechanism(_FREE_ROOT_PREFIX).joint_names]
-        self._parent = [joint.parent_index for joint in tree.joints]
         self._axis = [np.array(joint.axis, float) for joint in tree.joints]
-        self._turns = [joint.kind == "revolute" for joint in tree.joints]
-        self._placed = [np.array(ca.DM(joint.placement.rotation)) for joint in tree.joints]
-        ends, found = dict[int, float](), list[_Link]()
-        for segment in system.segment_layouts:
-            for joints, length in zip(segment.link_joints, lengths[segment.name], strict=True):
-                indices = tuple(tree.joint_index(joint) for joint in joints)
-                begin = ends.get(self._parent[indices[0]], 0.0)
-                ends[indices[-1]] = begin + float(length)
-                found.append(_Link(indices, begin, ends[indices[-1]]))
-        carrying = {self._parent[link.joints[0]] for link in found}
-        lasts = [link.joints[-1] for link in found]
-        tips = [last for last in lasts if last not in carrying]
-        self._corners = [0, *(2 * lasts.index(tip) + 1 for tip in tips)]
-        ways = {tip: set(tree.ancestor_joint_indices(tip)) for tip in tips}
-        behind = (next(k for k, tip in enumerate(tips) if last in ways[tip]) for last in lasts)
-        self._links = [link._replace(tip=tip) for link, tip in zip(found, behind, strict=True)]
-        self._root_to_tip_lengths = np.array([ends[tip] for tip in tips])
-        shared = np.zeros((len(tips), len(tips)))  # length that the ways to two tips have in common
-        for a, b in np.ndindex(shared.shape):
-            common = ways[tips[a]] & ways[tips[b]]
-            shared[a, b] = max((ends[joint] for joint in common if joint in ends), default=0.0)
-        to_tips = np.array([0.0, *self._root_to_tip_lengths])
-        self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(shared, ((1, 0), (1, 0)))
-        np.fill_diagonal(self._end_distances, 0.0)
+        q = ca.SX.sym("q", len(tree.joints))
+        turned = ca.densify(ca.horzcat(*forward_kinematics(tree, q).joint_rotations))
+        self._rotations = dense_function_evaluator(ca.Function("rotations", [q], [turned]))
+        chains = [tuple(map(tree.joint_index, names)) for own in system.segment_layouts for names in own.link_joints]
+        sizes = [float(length) for own in system.segment_layouts for length in lengths[own.name]]
+        # the root and the ends of all links are the nodes of a tree
+        ends = {chain[-1]: node for node, chain in enumerate(chains, start=1)}
+        starts = [ends.get(tree.joints[chain[0]].parent_index, 0) for chain in chains]
+        graph = coo_matrix((sizes, (starts, list(ends.values()))), shape=(1 + len(chains),) * 2)
+        far = np.asarray(dijkstra(graph.tocsr(), directed=False))
+        tips = [node for node in ends.values() if node not in starts]
+        self._corners = [0, *(2 * tip - 1 for tip in tips)]
+        self._root_to_tip_lengths, self._end_distances = far[0, tips], far[np.ix_([0, *tips], [0, *tips])]
+        ways = [tree.ancestor_joint_indices(chains[tip - 1][-1]) for tip in tips]
+        behind = [next(k for k, way in enumerate(ways) if chain[-1] in way) for chain in chains]
+        reaches = zip(chains, far[0, starts], far[0, 1:], behind, strict=True)
+        self._links = [_Link(chain, float(begin), float(end), tip) for chain, begin, end, tip in reaches]
 
     def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
         """Find initial shapes that follow a centerline whose path lengths between ends match the object's lengths.
@@ -291,13 +274,10 @@ class ShapeGuessFinder:
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q, first = self._rest.copy(), self._links[0]
-        turned: list[Array] = []  # orientation of every joint's moving frame in the world
-        for j, parent in enumerate(self._parent):
-            turned.append((turned[parent] if parent >= 0 else np.eye(3)) @ self._own(j, q[j]))
         aim = courses[first.tip].direction(first.begin, first.end)
-        carry = Rotation.align_vectors(aim, turned[first.joints[-1]][:, 2])[0].as_matrix()
+        carry = Rotation.align_vectors(aim, self._orientation(q, first.joints[-1])[:, 2])[0].as_matrix()
         for link in self._links[1:]:
-            self._bend(q, link.joints, carry.T @ courses[link.tip].direction(link.begin, link.end), turned)
+            self._bend(q, link.joints, carry.T @ courses[link.tip].direction(link.begin, link.end))
         place = courses[first.tip].at(0.0)
         q[self._root[:3]] = place
         q[self._root[3:]] = Rotation.from_matrix(carry).as_euler("XYZ")
@@ -308,27 +288,24 @@ class ShapeGuessFinder:
             anchors.append(ObservedObjectEnd(corner, ahead, middle, width / np.sqrt(12.0)))
         return _InitialShape(q, place, tuple(anchors))
 
-    def _own(self, joint: int, value: float) -> Array:
-        if not self._turns[joint] or value == 0.0:
-            return self._placed[joint]
-        return np.asarray(self._placed[joint] @ Rotation.from_rotvec(value * self._axis[joint]).as_matrix())
+    def _orientation(self, q: Array, joint: int) -> Array:
+        """Orientation (3, 3) of a joint's moving frame in the world."""
+        return self._rotations(q)[0][:, 3 * joint : 3 * joint + 3]
 
-    def _bend(self, q: Array, joints: Sequence[int], aim: Array, turned: list[Array]) -> None:
-        """Set the bends in `q` of a link so that its long axis z has the direction `aim`. Updates `turned`, too."""
-        bends, carrier = [j for j in joints if j in self._bends], self._parent[joints[0]]
-        base, ahead = turned[carrier] if carrier >= 0 else np.eye(3), np.array([0.0, 0.0, 1.0])
-        for j in joints:
-            if bends and j == bends[0]:
-                local, axis = (base @ self._placed[j]).T @ aim, self._axis[j]
-                if len(bends) > 1:  # turns about the first axis leave what lies along it
-                    other = self._axis[bends[1]]
-                    rate = float(np.cross(other, ahead) @ axis)
-                    q[bends[1]] = np.arcsin(np.clip(rate * float(local @ axis), -1.0, 1.0))
-                    ahead = Rotation.from_rotvec(q[bends[1]] * other).apply(ahead)
-                level = float(local @ ahead) - float(local @ axis) * float(ahead @ axis)
-                q[j] = np.arctan2(float(local @ np.cross(axis, ahead)), level)
-            base = base @ self._own(j, q[j])
-            turned[j] = base
+    def _bend(self, q: Array, joints: Sequence[int], aim: Array) -> None:
+        """Set the bends in `q` of a link so that its long axis z has the direction `aim`."""
+        bends, ahead = [j for j in joints if j in self._bends], np.array([0.0, 0.0, 1.0])
+        if not bends:
+            return
+        q[bends[0]] = 0.0
+        local, axis = self._orientation(q, bends[0]).T @ aim, self._axis[bends[0]]
+        if len(bends) > 1:  # turns about the first axis leave what lies along it
+            other = self._axis[bends[1]]
+            rate = float(np.cross(other, ahead) @ axis)
+            q[bends[1]] = np.arcsin(np.clip(rate * float(local @ axis), -1.0, 1.0))
+            ahead = Rotation.from_rotvec(q[bends[1]] * other).apply(ahead)
+        level = float(local @ ahead) - float(local @ axis) * float(ahead @ axis)
+        q[bends[0]] = np.arctan2(float(local @ np.cross(axis, ahead)), level)
 
 
 class _Course:

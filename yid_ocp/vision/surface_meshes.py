@@ -269,14 +269,11 @@ def load_robot_meshes_by_joint(urdf: str | Path, mechanism: Mechanism) -> dict[i
     import yourdfpy
 
     path = urdf_path_from_robot_name(urdf)
-    if not is_file(path):
-        what, allowed = f"there is no URDF file '{path}'", "the path of a URDF file, or package:NAME"
-        raise ModelError(what, where=str(urdf), allowed=allowed, hint="set model.robot to one, such as package:ur5")
     bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
         robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        reason = f"an element has no {error}" if isinstance(error, KeyError) else error
+        reason = f"an element has no {error}" if isinstance(error, KeyError) else getattr(error, "what", error)
         what, hint = f"the URDF cannot be read: {reason}", "check it with check_urdf, or export it again"
         raise ModelError(what, where=str(path), allowed="a URDF file with links and joints", hint=hint) from error
     parts: dict[int, list[TriangleMesh]] = {}
@@ -445,10 +442,8 @@ class DepthCameraModel:
         from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
 
         scale, shape = self.intrinsics.fx * self.baseline, depth.shape
-        white = rng.standard_normal(shape)
-        if self.noise_correlation_length > 0:
-            white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
-            white /= white.std()
+        white = gaussian_filter(rng.standard_normal(shape), self.noise_correlation_length, mode="wrap")
+        white /= white.std()
         chance, far = rng.random((4, *shape)), np.where(np.isfinite(depth), depth, 1e3)
         front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
         edge = back - front > self.min_relative_edge_depth * front
@@ -480,27 +475,6 @@ class DepthCameraModel:
         return np.asarray(disparity < nearest[flat] - 1.0)
 
 
-@dataclass(frozen=True)
-class VirtualCameraTiming:
-    """The timing of a virtual camera: frame rate, dropped frames and errors of time stamps."""
-
-    mean_rate: float = 3.0  # [Hz]
-    dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
-    latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
-    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
-
-    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
-        if not self.mean_rate > 0:
-            what, hint = f"mean_rate is {self.mean_rate}, but must be above 0", "pass for example mean_rate=3.0"
-            raise ConfigError(what, where="VirtualCameraTiming", allowed="a frame rate above 0 [Hz]", hint=hint)
-        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
-        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
-        taken = taken[taken < stop]
-        taken = taken[rng.random(len(taken)) >= self.dropped_frame_fraction]
-        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
-
-
 @dataclass(frozen=True, eq=False)
 class VirtualFramesWithTruth:
     """The frame sequence of a virtual camera, with the true capture times and the true motion."""
@@ -512,12 +486,23 @@ class VirtualFramesWithTruth:
 
 @dataclass(frozen=True, eq=False)
 class VirtualCameraSetup:
-    """A virtual depth camera, described by sensor model, pose and frame timing."""
+    """A virtual depth camera, described by pose, sensor model, frame rate, dropped frames and errors of time stamps."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     sensor_model: DepthCameraModel = field(default_factory=DepthCameraModel)  # default: an Asus Xtion Pro Live
-    timing: VirtualCameraTiming = field(default_factory=VirtualCameraTiming)
+    mean_rate: float = 3.0  # [Hz]
+    dropped_frame_fraction: float = 0.0  # fraction of frames that never arrive
+    latency: float = 0.0  # stamp minus capture time, camera clock offset included [s]
+    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
     seed: int = 0  # seed of all random draws
+
+    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Times (M,) [s] of the frames that arrive, and their stamps (M,) [s]."""
+        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
+        taken = taken[taken < stop]
+        taken = taken[rng.random(len(taken)) >= self.dropped_frame_fraction]
+        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
 
 
 def render_virtual_frames(
@@ -530,7 +515,7 @@ def render_virtual_frames(
     """
     lens, pose = camera.sensor_model.intrinsics, frames.validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
-    taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
+    taken, stamps = camera._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, np.asarray(q, float), axis=0)
     configuration = np.asarray(course(taken))
     tree = scene.system.mechanism_with_values(scene.parameter_values)

@@ -155,8 +155,7 @@ class SingleFrameTracker:
         """Configuration (n,) at a time of the joints' clock, with an undeformed object; constant beyond the joints."""
         q = self.shape_fitter.rest_configuration.copy()
         if self.joint_angles_at is not None:
-            index = [self.system.mechanism.joint_index(name) for name in self.shape_fitter.recorded_joint_names]
-            q[index] = self.joint_angles_at(t)
+            q[self.shape_fitter.recorded_joint_indices] = self.joint_angles_at(t)
         return q
 
     def estimate_shared_values(self) -> SequenceEstimates:
@@ -479,15 +478,12 @@ def _joint_angles(
 
 def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
     """Indices of the frames by time stamp, and why frames without a stamp or with a repeated stamp are dropped."""
-    reasons = {int(i): "the image's time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
-    order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
-    before = -math.inf
-    for i in (i for i in order if i not in reasons):
-        if stamps[i] - before < _SAME_TIME_TOLERANCE:
-            reasons[i] = "the image's time stamp equals that of another image, so it is a duplicate"
-        else:
-            before = float(stamps[i])
-    return tuple(order), reasons
+    times = np.where(np.isfinite(stamps), stamps, np.nan)
+    order = np.argsort(times, kind="stable")  # NaN come last
+    again = order[np.diff(times[order], prepend=-np.inf) < _SAME_TIME_TOLERANCE]
+    reasons = dict.fromkeys(np.flatnonzero(np.isnan(times)).tolist(), "the image's time stamp is not a number")
+    why = "the image's time stamp equals that of another image, so it is a duplicate"
+    return tuple(order.tolist()), reasons | dict.fromkeys(again.tolist(), why)
 
 
 def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:

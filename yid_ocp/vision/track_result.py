@@ -156,7 +156,7 @@ def _pictures(stages: SingleFrameStages) -> list[_Picture]:
     if near is not None and skeleton is not None:
         faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
         made.append(_Picture("skeleton", f"{len(skeleton.nodes)} points along the object (skeleton)", [faint, nodes]))
-        parts = count_with_noun(len(set(skeleton.component_of_node.tolist())), "connected part")
+        parts = count_with_noun(len(skeleton.nodes) - len(edges), "connected part")  # the edges close no loop
         made.append(_Picture("graph", f"{count_with_noun(len(edges), 'edge')}, {parts}", [nodes], list(edges), _BLUE))
         if fit is not None:
             off = f", {1e3 * fit.mean_distance:.1f} mm from the points on average (image used)"

@@ -123,7 +123,7 @@ class _CalibratedModel:
     def text(self, form: str, system: System) -> str:
         values = self.values_for(system)
         if form == "mjcf":
-            return mujoco_xml(system, values, emulate=True, actuators=True)
+            return mujoco_xml(system, values, standalone=True)
         return (models.system_to_urdf if form == "urdf" else models.system_to_sdf)(system, values)
 
 
@@ -272,7 +272,7 @@ def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> d
         nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
         system, nominal = (_with_recorded_points(own, recordings) for own in (system, nominal))
         recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
-        before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
+        before = _replayed(mujoco_xml(nominal, standalone=True), nominal, recordings, progress)
         after = _replayed(calibrated.text("mjcf", system), system, recordings, progress, 1)
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": ". Try: ".join(filter(None, (error.what, error.hint)))}

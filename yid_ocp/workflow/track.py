@@ -208,10 +208,9 @@ def _simulate_recording_and_camera_frames(run: RunSettings, system: System) -> t
         experiment = VirtualExperimentSettings(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = recording_from_simulation(system, None, experiment, truth)
-        rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
-        timing = surface_meshes.VirtualCameraTiming(rate, settings.dropped_frame_fraction, *latency)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
-        camera = surface_meshes.VirtualCameraSetup(pose, timing=timing, seed=seed)
+        timing = files.attributes_to_dict(settings, "mean_rate=frame_rate dropped_frame_fraction latency latency_std")
+        camera = surface_meshes.VirtualCameraSetup(pose, seed=seed, **timing)
         made = surface_meshes.render_virtual_frames(_camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
