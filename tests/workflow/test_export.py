@@ -144,7 +144,7 @@ def test_sdf_has_springs_too(found, tmp_path, exported) -> None:
 def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
     effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
     effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
-    effects |= {"joint_load_friction@left_e1.share": 0.1}
+    effects |= {"joint_load_friction@left_e1.share": 0.1, "grasp_compliance@left.compliance": 0.0}
     law = "model.friction={law: load, joints: [left_e1]}"
     coarse = load_config(None, ["model.object.links=1", law], SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME)
     manifest = exported(written_run(tmp_path / "both", effects, coarse, False), tmp_path / "both.xml")
@@ -154,7 +154,9 @@ def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
         "junction_compliance@w_T1": "not representable",
         "joint_coulomb@left_e1": "emulated",
         "joint_load_friction@left_e1": "not representable",
+        "grasp_compliance@left": "native",
     }
+    assert manifest["grasps"]["left"] == {"status": "native", "how": "equality constraints between sites"}
     assert "memory" in manifest["effects"]["hysteresis@T2"]["how"]
     assert manifest["parameters"]["hysteresis@T2.stiffness"]["status"] == "not representable"
     assert manifest["gate"] == {"status": "not done", "reason": "the run has no recordings"}

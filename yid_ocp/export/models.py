@@ -142,7 +142,7 @@ def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:
 _READING = FeatureExportSupport(
     "not representable", f"{mjcf.elements_by_aspect_and_file_format()['reading']['is']}. Correct the readings instead"
 )
-_NEUTRAL = FeatureExportSupport("native", "it changes nothing at this value, so the file omits it")
+NEUTRAL_EFFECT_SUPPORT = FeatureExportSupport("native", "it changes nothing at this value, so the file omits it")
 _UNUSED = FeatureExportSupport("native", "no motion or force of this model depends on it, so nothing is lost")
 
 
@@ -152,7 +152,7 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
     for effect in system.effects:
         label = f"{effect.kind}@{effect.location}"
         if value.is_effect_neutral(effect):
-            found[label] = _NEUTRAL
+            found[label] = NEUTRAL_EFFECT_SUPPORT
         else:
             _, aspects = mjcf.effect_joint_terms_and_changed_aspects(system, effect, value)
             found[label] = _worst([_aspect_support(x, form) for x in sorted(aspects)])

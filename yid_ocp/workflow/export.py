@@ -210,7 +210,7 @@ def _grasp_support(form: str, compliance: FeatureExportSupport | None) -> Featur
         why = f"{form.upper()} describes a tree: close the loop in the engine"
         return FeatureExportSupport("not representable", why)
     rigid = "equality constraints between sites"
-    if compliance is None or compliance.how.startswith("neutral"):
+    if compliance in (None, models.NEUTRAL_EFFECT_SUPPORT):
         return FeatureExportSupport("native", rigid)
     is_lost = compliance.status == "not representable"
     return FeatureExportSupport("emulated", f"{rigid}: the grasp is rigid" if is_lost else "a tendon with a spring")
@@ -242,7 +242,7 @@ def _expressible(
     said = models.export_support_by_effect(full, calibrated.values_for(full), form)
     while True:
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
-        kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]
+        kept = [label for label, entry in told.items() if entry != models.NEUTRAL_EFFECT_SUPPORT]
         system = calibrated.system(kept)
         try:
             calibrated.text(form, system)
