@@ -99,14 +99,15 @@ class Twin:
         how = VirtualExperimentSettings(motion, start, simulation, noise, None, interruptions, seed, f"run_{seed}")
         return run_virtual_experiment(self.driven, None, how)
 
-    def problem(self, *recordings: Recording) -> EstimationProblem:
+    def problem(self, *recordings: Recording, duration: float | None = None) -> EstimationProblem:
         sensors = {"joints.effort": SensorOptions(std=0.02), "joints.position": SensorOptions(std=5e-5)}
         step = compile_step(self.prescribed, 0.01)
         free = [f"{joint}.damping" for joint in JOINTS]
-        return EstimationProblem(step, recordings, free, ProblemOptions(sensors=sensors, path_cutoff=8.0))
+        options = ProblemOptions(sensors=sensors, path_cutoff=8.0, duration=duration)
+        return EstimationProblem(step, recordings, free, options)
 
-    def events(self, *recordings: Recording) -> EventSet:
-        problem = self.problem(*recordings)
+    def events(self, *recordings: Recording, duration: float | None = None) -> EventSet:
+        problem = self.problem(*recordings, duration=duration)
         x = fit_problem(problem, GaussNewton()).x
         return find_force_and_fault_events(problem, x, problem.evaluate(x), None)
 
@@ -236,6 +237,7 @@ def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
     assert event.peak_value == pytest.approx(0.05, abs=2e-3)
     assert event.start_time == pytest.approx(wrong.joints.t[500], abs=0.006)
     assert event.end_time == pytest.approx(wrong.joints.t[501], abs=0.006)
+    assert not twin.events(wrong, duration=2.0), "a wrong sample after the part that is used"
 
 
 @pytest.mark.parametrize(("count", "wrong", "named"), [(45, 1, 1), (45, 3, 1), (45, 4, 0), (39, 1, 0)])

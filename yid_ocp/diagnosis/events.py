@@ -422,14 +422,16 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
     joints = episode.recording.joints
     if joints is None:
         return
+    t = joints.t - episode.grid.start_time
+    inside = (t >= 0) & (t <= episode.grid.node_times[-1] - episode.grid.start_time)
     for quantity in ("position", "effort"):
         values, unit = joints.values_by_channel.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
         for column, joint in enumerate(joints.names):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
-                noise = np.full(len(joints.t), max(floor, quantization_step(values[:, column])))
-                about = (episode.name, joint, f"joints.{quantity}.{joint}", unit)
-                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, about)
+                own = values[inside, column]
+                noise = np.full(len(own), max(floor, quantization_step(own)))
+                yield from _alone(t[inside], own, noise, (episode.name, joint, f"joints.{quantity}.{joint}", unit))
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:

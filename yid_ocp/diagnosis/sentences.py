@@ -47,11 +47,14 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
     movable = ", ".join([name for name in first if name not in still])
     most = f"Record slow and fast motions, with pauses, and most motion where the gap is (part or grasp): {movable}."
-    larger = "Record faster and larger motions of all joints, which show more effects."
+    larger = "Record faster and larger motions, which show more effects."
+    since = result.baseline_comparison
+    changed = "Find out what changed the parameters since the earlier runs."
+    enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
         "unknown": _said((movable, most), (True, larger))[0],
-        "no_gap": "Nothing is needed for motions like these. Other motions may still show a gap.",
+        "no_gap": _said((since and since.significant_parameter_shifts, changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
     }
@@ -153,7 +156,12 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
     origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
-    parts = [(p.gap_share, " or ".join([p.location, *p.indistinguishable_from])) for p in where]
+    sensors = {own.channel.rpartition(".")[0] for own in result.noise_floor}
+
+    def words(place: str) -> str:
+        return f"the readings of {place}" if place in sensors else place
+
+    parts = [(p.gap_share, " or ".join(map(words, [p.location, *p.indistinguishable_from]))) for p in where]
     named = [f"{place} ({100 * part:.0f} %)" for part, place in parts]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
@@ -187,8 +195,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     places = listed([effect.location for effect in alike])
     several = f"{kind} is significant at several locations (p below {level:.2g}): {places}."
     add = f"Add {kind} at {places} under model.effects (friction: as `yid-ocp friction` advises), and repeat "
-    longer = f"To test the rest, raise diagnosis.budget above {result.thresholds.budget} s."
-    limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tested: "
+    longer = f"To try the rest, raise diagnosis.budget above {result.thresholds.budget} s."
+    limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tried: "
     laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
     told = listed([event.text for event in events], max_entries=_MAX_NAMED)
@@ -231,7 +239,10 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
     more = f"Only {', '.join(kinds)} was tried. To try all effects, set diagnosis.candidates: all."
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
-    none = _said((result.single_effect_models, tried), (result.untried, stopped), (True, tried))[0]
+    unlike = f"no tried effect resembles the error better than chance (p below {limits.significance_level:g})"
+    failed = "every refit with an effect failed"
+    causes = (result.untried, stopped), (result.record.refits, failed), (True, unlike)
+    none = _said((result.single_effect_models, tried), *causes)[0]
     few += "".join(_said((math.isfinite(closed), end)))
     why, advice = {
         "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),

@@ -98,7 +98,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_page_only = len(fitted) > 1 or verdict == "no gap"
     yield SummaryTable(untried, "Effects that were not fitted, with forecasts of their size", is_page_only=is_page_only)
     yield "p-value: probability that noise alone resembles the effect as much." if verdict != "no gap" else ""
-    yield f"result.json has all {count} effects that were tested." if (count := len(result["which"])) else ""
+    yield "result.json has the p-values of all screened effects." if result["which"] else ""
     unseen = result.get("unseen", ())
     yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
     missing = result.get("not_candidates", {}).items()

@@ -163,7 +163,8 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
         lost = abbreviated_names_text(use.get("left_out", ()))
         yield f"Too uncertain, so not listed: {lost}." if lost else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
-        for words, lines in (kinds | {"a model file": [use["export"]], "a citation": [use["cite"]]}).items():
+        model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
+        for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():
             yield f"For {words}:" if lines else ""
             yield CodeBlock("\n".join(lines))
 

@@ -79,7 +79,8 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         again = "solve", os.path.relpath(folder.final_path / "config.yaml"), "--set", f"model.friction={section}"
         model = ["model:", f"  friction: {section}"]
         copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters, again
-        result["to_use"] = copyable_estimate_texts(*copied, checks.uncounted_errors, model)
+        texts = copyable_estimate_texts(*copied, checks.uncounted_errors, model)
+        result["to_use"] = texts if best.is_converged else {}
         folder.log_event("end", warranted=best.law)
         known = {"problem": problem, "solution": solution, "section_data": {"friction_clouds": clouds}}
         written = folder.write_result_and_report(run, progress, result, **known)
