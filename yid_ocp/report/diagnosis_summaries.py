@@ -559,12 +559,10 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
-    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run's model."
-    yield SummaryStatement(
-        said if lost else "The file has all parts of the model that are listed below." if entries else "", "conclusion"
-    )
+    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run."
+    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
     gate = manifest["gate"] or {}
-    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate))
+    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, manifest["unknown"]))
     if unknown := manifest["unknown"]:
         text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has them with the values"
         yield SummaryStatement(f"{text} where the search ended. Do not rely on them.", "verdict")
@@ -578,7 +576,7 @@ def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
 
 
-def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
+def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
     """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
     if "reason" in gate:
         yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
@@ -591,6 +589,8 @@ def _replay_sentences(gate: Mapping[str, Any]) -> Iterator[str]:
         return
     ratios, initial = ({n: gate["channels"][n][key] / noise[n] for n in noise} for key in ("after", "before"))
     worst = max(ratios, key=lambda name: ratios[name])
-    text = f"In MuJoCo, the file {'reproduces' if ratios[worst] < _MAX_REPRODUCED_ERROR else 'does not reproduce'} the"
-    text += f" {held}: the largest error (of {worst}) is {ratios[worst]:.4g} times its noise"
-    yield f"{text} (allowed: up to {_MAX_REPRODUCED_ERROR}). With the initial values it is {max(initial.values()):.4g}."
+    is_bad = ratios[worst] > _MAX_REPRODUCED_ERROR
+    text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
+    text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
+    yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
+    yield "The unreliable values below may be the cause." if is_bad and unreliable else ""

@@ -66,7 +66,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
-        print_result(arguments, manifest, lambda: summary_terminal_lines(summarize_export(manifest)), out, out)
+        blocks = summarize_export(manifest)
+        print_result(arguments, manifest, lambda: summary_terminal_lines(blocks), f"model: {out}", out)
         return EXIT_DONE
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
