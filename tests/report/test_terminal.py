@@ -178,7 +178,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     said = "Twice the links would change these estimates by more than their ± from noise: p.a by -5.5 (± 0.073)."
     rest = "Half the time step would change no estimate by more than its ± from noise."
     assert lines.index("it snaps") < (at := lines.index(said))
-    cure = "To reduce these errors, set model.object.links: 8, and solve again."
+    cure = "For a smaller ±, set model.object.links: 8, and solve again."
     assert lines[at + 1 : at + 4] == ["The ± of the table includes this.", rest, cure]
     noisy = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
     ends = [" ".join(told("yid-solve/1", solved(discretisation=noisy, status=s))) for s in ("converged", "stalled")]

@@ -345,7 +345,8 @@ def finer_setting_texts(problem: EstimationProblem) -> dict[str, str]:
     options, divided = problem.options, problem.options.divided_links_model
     found = {"links": divided.setting_text} if divided is not None and divided.setting_text else {}
     found["time_step"] = f"problem.time_step: {problem.step.time_step / 2:g}"
-    return found | {"encoder_noise": f"problem.path_cutoff: {options.path_cutoff / 2:g}" if options.path_cutoff else ""}
+    cutoff = f"problem.path_cutoff: {options.path_cutoff / 2:g} (at least the highest frequency of the arm)"
+    return found | {"encoder_noise": cutoff if options.path_cutoff else ""}
 
 
 def parameter_shifts_at_finer_discretisation(

@@ -225,7 +225,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     if quiet:
         tried_words, what = " or ".join(quiet), "" if said else ", so the simulation is accurate enough"
         said.append(f"{tried_words.capitalize()} would change no estimate by more than its ± from noise{what}.")
-    return said + ([f"To reduce these errors, set {' and '.join(cures)}, and solve again."] if cures else [])
+    return said + ([f"For a smaller ±, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
