@@ -291,6 +291,11 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     assert small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & 1 \\"]
     assert small["values"] == ["T1.bend = 2.2e-05 ± 5e-07"]
     assert copied(system, {}, **lost) == {}
+    system = build_system(load_config(None, ["model.frames={tip: {parent_frame: w_T1, position_std: 0.01}}"]))
+    marker = {"tip.x": (0.01, 0.001, "m", "identifiable")}
+    assert copied(system, {}, **marker)["values"] == ["tip.x = 0.01 ± 0.001 m"]
+    both = copied(system, {"T1.bend": 22.0}, **marker, **found)
+    assert [len(both[key]) for key in ("values", "latex", "yaml")] == [1, 1, 3], "an offset is no result"
 
 
 def test_a_frequency_that_follows_the_time_step_tells_of_a_start_that_is_too_stiff():

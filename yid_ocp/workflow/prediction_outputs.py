@@ -82,7 +82,8 @@ def copyable_estimate_texts(
 
     The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (other free parameters),
     `joints` (number of links, range of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first
-    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters.
+    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters. `values`
+    and `latex` have no offsets of points beside other estimates.
     """
     found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
@@ -107,9 +108,12 @@ def copyable_estimate_texts(
     starts = (f"  {name}: {{free: true, initial: {e.value:.6g}}}" for name, e in found.items())
     labels = {n: n.replace("_", r"\_") for n in found}
     told = {n: f"{e.value:.4g} ± {e.std:.2g}" for n, e in found.items()}
-    rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in found.items()]
+    # nobody quotes the offset of a marker
+    offsets = {f"{frame}.{axis}" for frame in system.mechanism.frames for axis in "xyz"}
+    quoted = {n: e for n, e in found.items() if n not in offsets} or found
+    rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in quoted.items()]
     return {
-        "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in found.items()],
+        "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in quoted.items()],
         "uncounted_errors": list(uncounted_errors),
         "left_out": [n for n, e in estimates.items() if e.free and n not in found],
         "joints": joints,
