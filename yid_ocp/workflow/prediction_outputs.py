@@ -82,8 +82,8 @@ def copyable_estimate_texts(
 
     The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (other free parameters),
     `joints` (number of links, range of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first
-    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters. `values`
-    and `latex` have no offsets of points beside other estimates.
+    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters.
+    `values` and `latex` have no offsets of points beside other estimates.
     """
     found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
