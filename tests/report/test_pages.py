@@ -156,7 +156,7 @@ def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monke
     )
     (tmp_path / "weather.html").write_text("<p>The sky was {{ sky }}.</p>")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(REPORT_SECTIONS, "_entries", dict(REPORT_SECTIONS._entries))
+    monkeypatch.setattr(REPORT_SECTIONS, "data", dict(REPORT_SECTIONS.data))
     importlib.import_module("weather_section")
     monkeypatch.delitem(sys.modules, "weather_section")
     body = written(findings(solved_pendulum), tmp_path).split("<body>")[1]

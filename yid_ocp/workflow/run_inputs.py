@@ -96,7 +96,8 @@ def _registering(
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
     except (Exception, SystemExit) as error:
         for registry, names in zip(registries, before, strict=True):
-            registry.unregister_names(set(registry) - names)
+            for own in set(registry) - names:
+                del registry[own]
         sys.modules.pop(module, None)
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
