@@ -191,7 +191,7 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
         assert second.stored_refit("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
         assert second.stored_refit("joint_viscous@elbow") is None
         assert len(caplog.records) == (0 if spoil == "nothing" else 1)
-        second.delete_file()
+        folder.delete_resume_data(second.file)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
