@@ -51,8 +51,7 @@ def _result_blocks(
     findings: ReportData,
 ) -> tuple[list[str], list[terminal.StatementTableOrCode], list[terminal.StatementTableOrCode]]:
     """Return conclusions and verdicts of a result, and its other blocks up to the key table and after it."""
-    known = terminal.SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
-    blocks = [] if known is None else known(findings.result)
+    blocks = terminal.summary_blocks(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, terminal.SummaryTable) and block.is_key_table)
     end = next(ends, 0)
     told = [block for block in blocks if isinstance(block, terminal.SummaryStatement) and block.kind != "note"]
