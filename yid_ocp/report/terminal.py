@@ -70,7 +70,7 @@ SUMMARIES: Registry[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]] =
 
 def summary_blocks(result: Mapping[str, Any]) -> list[StatementTableOrCode]:
     """Return the summary of a result without empty texts and tables that have only a header. Empty without summary."""
-    form = result.get("format")
+    form = str(result.get("format"))
     parts = SUMMARIES[form](result) if form in SUMMARIES else ()
     blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in parts)
     return [own for own in blocks if (len(own.rows) > 1 if isinstance(own, SummaryTable) else own.text)]
