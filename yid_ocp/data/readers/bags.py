@@ -228,7 +228,6 @@ def _read_bag(
 
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
     path = Path(path)
-    file_sha256(path)
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]

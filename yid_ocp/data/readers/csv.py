@@ -163,7 +163,6 @@ def _mounted_sensors(
 
 def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     path = Path(path)
-    file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
         group, _, remarks = capture
         count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), mean_sample_rate(group.t)
