@@ -241,7 +241,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     assert f"The blind test has {len(marks)} synthetic cases (seed 1" in page
     assert ("0 of 5 cases without an effect had a false alarm." in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="folder to write to does not exist"):
         draw_blind_validation_figures(tmp_path / "nowhere", result)
 
 
