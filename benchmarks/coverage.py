@@ -38,7 +38,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
+from yid_ocp.report.terminal import aligned_table_lines, summary_blocks, summary_terminal_lines
 from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.version import sha256_of_folder_sources
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperimentSettings, run_virtual_experiment
@@ -212,9 +212,7 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             for name, entry in result["parameters"].items()
             if entry["free"]
         },
-        "diagnose": any(
-            "diagnose" in line for line in summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
-        ),
+        "diagnose": any("diagnose" in line for line in summary_terminal_lines(summary_blocks(result))),
     }
 
 

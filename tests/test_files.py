@@ -136,7 +136,6 @@ OPENED_ELSEWHERE = {
     "data.recording_hdf5.create_hdf5_atomically": "writes",
     "data.recording_hdf5._complaint": "in the process that is tried first",
     "data.readers.c3d._complaint": "in the process that is tried first",
-    "data.readers.lerobot._files": "the format of a name",
     "export.signals.export_recording_csv_files": "writes",
     "integrator.codegen.kernel_c_source": "sources in C that come with the package",
     "integrator.codegen.kernel_cache_key_text": "sources that come with the package",

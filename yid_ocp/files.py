@@ -222,13 +222,11 @@ def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
     """Restore a dataclass instance from data that `to_lossless_plain_data` returned."""
-    return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
+    hints = _type_hints(typing.cast(typing.Hashable, kind))
+    return kind(**{name: _value(hint, data[name]) for name, hint in hints.items() if name in data})
 
 
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    hints = typing.get_type_hints(kind)
-    return {entry.name: hints[entry.name] for entry in dataclasses.fields(kind)}
+_type_hints = cache(typing.get_type_hints)
 
 
 def _value(hint: Any, value: Any) -> Any:

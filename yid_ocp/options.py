@@ -42,7 +42,7 @@ class OptionInfo:
     is_path: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RegistryChoice:
     """An annotation: a setting chooses a class of `registry` by its key `selector_key` or by its key in a mapping."""
 

@@ -10,7 +10,7 @@ from made_cross import TRUTH, configuration, record
 import yid_ocp as yid
 from yid_ocp.analysis.discretisation import stds_with_discretisation_and_encoder_errors
 from yid_ocp.config.reader import load_config
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import summary_blocks, summary_terminal_lines
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.workflow.solve import run_solve
 
@@ -54,7 +54,7 @@ def test_too_few_links_are_told_and_counted(coarse):
     assert entry["verdict"] == "not_trusted"
     # with twice the links it is nearer to the truth by what is said
     assert -error < coarse[1]["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"] < -0.4 * error
-    said = "\n".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[coarse[1]["format"]](coarse[1])))
+    said = "\n".join(summary_terminal_lines(summary_blocks(coarse[1])))
     assert "Twice the links would change these estimates by more than their" in said
     assert re.search(r"Twice the links would remove 3\d % of the error beyond\snoise\.\sFirst\sset", said)
 

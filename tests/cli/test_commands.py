@@ -20,7 +20,7 @@ from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import read_recording
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
+from yid_ocp.report.terminal import summary_blocks
 
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
@@ -267,7 +267,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     assert float(row[2]) == pytest.approx(float(row[1].split()[0]) * damping["along"], rel=0.02)
     assert done.out.startswith("All free parameters change the readings visibly.")
     result["dependence"]["shoulder.stiffness"]["along"] = 0.1
-    assert SUMMARY_BY_RESULT_FORMAT["yid-inspect/1"](result)[0].text.count("hardly determine shoulder.stiffness,")
+    assert summary_blocks(result)[0].text.count("hardly determine shoulder.stiffness,")
     # what is not asked for is in the result alone
     assert ("shoulder.stiffness" in table, "elbow.mass" in table) == (False, True)
     assert len(result["dependence"]["elbow.mass"]["rows"]) == 4

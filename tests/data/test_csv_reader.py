@@ -404,7 +404,7 @@ def test_every_file_of_the_folder_registers_a_format() -> None:
 
 
 def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(READERS, "_entries", dict(READERS._entries))
+    monkeypatch.setattr(READERS, "data", dict(READERS.data))
 
     @READERS.register(".one")
     def read_one(path: Path, *, value: float = 1.0) -> Recording:

@@ -12,7 +12,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import summary_blocks, summary_terminal_lines
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.plan import discrimination_plan_settings, identified_parameters_with_covariance, run_plan
 from yid_ocp.workflow.simulate import run_simulate
@@ -164,14 +164,14 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     planned = read_recording(tmp_path / "out" / "recording.h5")
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     assert '<section id="plan">' in (tmp_path / "out" / "report.html").read_text()
-    words = " ".join(summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result)))
+    words = " ".join(summary_terminal_lines(summary_blocks(result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"{100 * known.std_planned:.2g} %" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
     assert "holds for the configured initial values" in words
     result["parameters"] = {name: own | {"verdict": "not_identifiable"} for name, own in result["parameters"].items()}
-    assert summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))[0].startswith("Do not use this ")
+    assert summary_terminal_lines(summary_blocks(result))[0].startswith("Do not use this ")
 
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
@@ -181,8 +181,8 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert section == {"goal": "information", **found}
     assert discrimination_plan_settings([], folder) is None
     result = {"summary": "", "verdict": "unknown", "next_plan": section, "seconds": {}, "which": []}
-    result |= {"unused_efforts": False, "gap": {"before": {"rmse": {}, "unit": {}}}}
-    lines = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT["yid-diagnosis/2"](result))
+    result |= {"format": "yid-diagnosis/2", "unused_efforts": False, "gap": {"before": {"rmse": {}, "unit": {}}}}
+    lines = summary_terminal_lines(summary_blocks(result))
     [command] = [line.strip() for line in lines if "yid-ocp plan" in line]
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
     overrides = [f"plan.effects_to_discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run_folder={folder}"]
@@ -191,7 +191,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
     assert {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]} == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    told = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[outcome.result["format"]](outcome.result))
+    told = summary_terminal_lines(summary_blocks(outcome.result))
     assert PAIR[0] in "\n".join(told)
 
 

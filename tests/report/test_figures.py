@@ -279,7 +279,7 @@ def test_patterns_stand_beside_each_other_and_empty_ones_are_left_out(drawn, tmp
 
 
 def test_a_picture_that_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(OutputError, match="cannot be written") as caught:
+    with pytest.raises(OutputError, match="does not exist") as caught:
         draw_sparsity_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
     assert str(tmp_path / "nowhere") in str(caught.value.where)
 

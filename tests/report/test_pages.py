@@ -30,7 +30,7 @@ from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, rendered_section_dicts
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT
+from yid_ocp.report.terminal import summary_blocks
 from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.diagnose import _held_out_predictions, _scenes
 from yid_ocp.workflow.solve import solution_to_result_dict
@@ -156,7 +156,7 @@ def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monke
     )
     (tmp_path / "weather.html").write_text("<p>The sky was {{ sky }}.</p>")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(REPORT_SECTIONS, "_entries", dict(REPORT_SECTIONS._entries))
+    monkeypatch.setattr(REPORT_SECTIONS, "data", dict(REPORT_SECTIONS.data))
     importlib.import_module("weather_section")
     monkeypatch.delitem(sys.modules, "weather_section")
     body = written(findings(solved_pendulum), tmp_path).split("<body>")[1]
@@ -317,7 +317,7 @@ def solved_page(tmp_path_factory, pendulum_data) -> Path:
 
 def test_a_page_says_what_the_terminal_says(solved_page):
     result = json.loads((solved_page.parent / "result.json").read_text())
-    said = terminal.summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
+    said = terminal.summary_terminal_lines(summary_blocks(result))
     assert_same_words("\n".join([*said, "run folder: x"]), text_of(solved_page.read_text(encoding="utf-8")))
 
 

@@ -57,7 +57,7 @@ def judged(said: str) -> dict:
 
 
 def told(form: str, result: dict) -> list[str]:
-    return terminal.summary_terminal_lines(terminal.SUMMARY_BY_RESULT_FORMAT[form](result))
+    return terminal.summary_terminal_lines(terminal.summary_blocks({**result, "format": form}))
 
 
 def line_of(lines: list[str], name: str) -> str:

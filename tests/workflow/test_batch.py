@@ -14,10 +14,11 @@ from yid_ocp.diagnosis.blind_scores import BlindCaseScore, blind_case_score_summ
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import InlineExecutor
-from yid_ocp.report.diagnosis_summaries import _batch_summary, blind_validation_markdown_lines
+from yid_ocp.report.diagnosis_summaries import blind_validation_markdown_lines
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_validation_figures
 from yid_ocp.report.sections import ReportData
+from yid_ocp.report.terminal import summary_blocks
 from yid_ocp.workflow import blind
 from yid_ocp.workflow.batch import batch_runs_from_configs, run_batch
 from yid_ocp.workflow.blind import EXPERIMENT_VARIATIONS, _blind_experiments_and_refinable_subset, run_blind
@@ -60,7 +61,7 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
     page = (out / "report.html").read_text()
     assert all(name in page for name in ("monday", "spoiled"))
     told["monday"]["parameters"]["elbow.damping"]["unit"] = "N"
-    assert all(f"elbow.damping [{unit}]" in repr(_batch_summary(first.result)) for unit in ("N", "N m s/rad"))
+    assert all(f"elbow.damping [{unit}]" in repr(summary_blocks(first.result)) for unit in ("N", "N m s/rad"))
     # both recordings are of one pendulum
     assert not any(entry["drifted"] for entry in first.result["history"]["parameters"].values())
 
@@ -240,7 +241,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     assert f"The blind test has {len(marks)} synthetic cases (seed 1" in page
     assert ("0 of 5 cases without an effect had a false alarm." in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="folder to write to does not exist"):
         draw_blind_validation_figures(tmp_path / "nowhere", result)
 
 

@@ -17,7 +17,7 @@ from rich.progress import Progress as Bars
 
 from yid_ocp.cli import main
 from yid_ocp.display import NULL_PROGRESS
-from yid_ocp.report.terminal import SummaryStatement
+from yid_ocp.report.terminal import SUMMARIES, SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow import command_runner
 from yid_ocp.workflow.solve import _iterate_logger
@@ -217,9 +217,7 @@ def test_who_does_not_look_is_shown_nothing_or_lines():
 def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, capsys, quiet, reached):
     monkeypatch.chdir(tmp_path)
     said = [SummaryStatement("a = 1"), SummaryStatement("done")]
-    monkeypatch.setattr(
-        command_runner, "SUMMARY_BY_RESULT_FORMAT", {"made": lambda result: said if result["a"] == 1 else []}
-    )
+    monkeypatch.setitem(SUMMARIES.data, "made", lambda result: said if result["a"] == 1 else [])
 
     def work(progress):
         progress.begin_stage("working")
@@ -236,7 +234,6 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setattr(command_runner, "SUMMARY_BY_RESULT_FORMAT", {"made": lambda result: []})
     made = command_runner.CommandOutcome(tmp_path / "there", {"format": "made"}, None)
     command_runner.run_command_and_print(asked(), lambda progress: made)
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

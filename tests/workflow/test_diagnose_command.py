@@ -21,7 +21,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.inference.whitening import problem_with_whitening_at, torque_biases_and_stds_per_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import summary_blocks, summary_terminal_lines
 from yid_ocp.workflow import diagnose as command
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import _SingleJsonFileRefitStore, _with_noise_only_stds, run_diagnose
@@ -191,7 +191,7 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
         assert second.stored_refit("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
         assert second.stored_refit("joint_viscous@elbow") is None
         assert len(caplog.records) == (0 if spoil == "nothing" else 1)
-        second.delete_file()
+        folder.delete_resume_data(second.file)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -278,7 +278,8 @@ def test_recorded_torques_that_nothing_uses_are_told(problem_of):
     cases = [("prescribed", unused), ("prescribed", STATED), ("driven", unused)]
     assert [has_unused_efforts(problem_of(role, sensors)) for role, sensors in cases] == [True, False, False]
     result = {"summary": "", "verdict": "no_gap", "next_plan": None, "seconds": {}, "which": [], "unused_efforts": True}
-    blocks = SUMMARY_BY_RESULT_FORMAT["yid-diagnosis/2"](result | {"gap": {"before": {"rmse": {}, "unit": {}}}})
+    result |= {"format": "yid-diagnosis/2", "gap": {"before": {"rmse": {}, "unit": {}}}}
+    blocks = summary_blocks(result)
     assert any("set sensors.joints.effort.use: true" in line for line in summary_terminal_lines(blocks))
 
 
@@ -346,7 +347,7 @@ def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole
         use, reader = result["to_use"], YAML(typ="safe")
         assert "elbow.tau_c = " in use["values"][-1]
         assert "frictionloss=" in use["mjcf"][-1]
-        told = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT[result["format"]](result))
+        told = summary_terminal_lines(summary_blocks(result))
         assert {*use["values"], *use["mjcf"]} <= {line.strip() for line in told}
         with (tmp_path / "merged.yaml").open("w") as file:
             reader.dump(merged(reader.load(rubbing), reader.load("\n".join(use["yaml"]))), file)

@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.cli import main
 from yid_ocp.report import diagnosis_summaries  # noqa: F401, it registers
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import summary_blocks, summary_terminal_lines
 from yid_ocp.workflow.run_history import _overlaid_parameters
 
 
@@ -75,6 +75,6 @@ def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
     channel = {"recording": "r", "channel": "points.p", "unit": "m", "held_out": True, "rmse": {"a": 1.0, "b": 2.0}}
     result = {"format": "yid-overlay/1", "runs": {"a": "a", "b": "b"}, "parameters": parameters}
     result |= {"channels": [channel | {"difference": 0.5}], "model_difference": "object"}
-    lines = summary_terminal_lines(SUMMARY_BY_RESULT_FORMAT["yid-overlay/1"](result))
+    lines = summary_terminal_lines(summary_blocks(result))
     assert "k          –  2.5 ± 0.1  N m/rad" in lines
     assert "The models differ (model.object), so a parameter may differ" in " ".join(lines)

@@ -212,7 +212,8 @@ def kinds():
     """Kinds that a test registers are forgotten after it."""
     before = set(EFFECTS)
     yield before
-    EFFECTS.unregister_names(set(EFFECTS) - before)
+    for name in set(EFFECTS) - before:
+        del EFFECTS[name]
 
 
 def configured(file, *names):
@@ -230,7 +231,7 @@ def test_a_file_is_run_once_and_its_kind_is_there(kinds, pendulum) -> None:
 
 
 def test_a_file_may_register_a_report_section_alone(kinds, pendulum, monkeypatch) -> None:
-    monkeypatch.setattr(REPORT_SECTIONS, "_entries", {})
+    monkeypatch.setattr(REPORT_SECTIONS, "data", {})
     text = "from yid_ocp.report.sections import register_report_section as made\nmade('weather', 15, 'Weather')(dict)\n"
     (pendulum.parent / "own.py").write_text(text)
     build_system(configured(pendulum, "own.py"))

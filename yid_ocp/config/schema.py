@@ -64,9 +64,8 @@ def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
     nullable = type(None) in get_args(bare)
     among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
     if among is not None:
-        registry = among.registry
-        classes = {name: registry[name] for name in registry}
-        return SectionVariants(classes, among.selector_key, among.default_name, registry.entry_noun, nullable)
+        noun = among.registry.entry_noun
+        return SectionVariants(dict(among.registry), among.selector_key, among.default_name, noun, nullable)
     kinds = [options.split_annotated(member)[0] for member in options.non_none_union_members(bare)]
     if len(kinds) != 1 or not all(map(dataclasses.is_dataclass, kinds)):
         return None

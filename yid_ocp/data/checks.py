@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, combinations, pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -41,25 +40,21 @@ _INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # grid for the comparison of intervals; 
 _HASH_BASE = np.uint64(0x9E3779B97F4A7C15)
 
 
-class _RecordingParts(NamedTuple):
-    """Parts of a recording between its gaps, and one issue for each gap."""
-
-    recordings: tuple[Recording, ...]
-    issues: tuple[Issue, ...] = ()
-
-
-def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
+def split_recording_at_gaps(
+    recording: Recording, driving: Sequence[str], anywhere: bool
+) -> tuple[list[Recording], list[Issue]]:
     """Split a recording at gaps of its joint samples or, without joints, of the samples of the `driving` points.
 
     The first part is kept, and each later part at whose start the joints stand still. If `anywhere` is True, parts that
     start in motion are kept too, because the problem can estimate their initial state. Very short parts are dropped.
+    Returns the parts, and one issue for each gap.
     """
     t = _times(recording, driving)
     steps = np.diff(t)
     allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * median_sample_period(t))
     gaps = np.flatnonzero(steps > allowed)
     if len(steps) < 2 or not len(gaps):
-        return _RecordingParts((recording,))
+        return [recording], []
     edges = [(0, gaps[0]), *((a + 1, b) for a, b in pairwise(gaps)), (gaps[-1] + 1, len(t) - 1)]
     kept = []
     for begin, end in edges:
@@ -68,11 +63,11 @@ def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhe
             kept.append(part)
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
-    named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
+    named = [replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False)]
     said = f"{count_with_noun(len(kept), 'part')} of the data ({left:.3g} s) {'is' if len(kept) == 1 else 'are'} used"
     if not anywhere and len(kept) < len(edges):
         said += " (with this problem.initial_state, a part must start at rest)"
-    return _RecordingParts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
+    return named, [_doubt(recording, t, int(gap), allowed, said) for gap in gaps]
 
 
 def _times(recording: Recording, driving: Sequence[str]) -> Array:

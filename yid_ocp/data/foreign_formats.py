@@ -234,37 +234,9 @@ def _broken(where: str, lacking: str) -> DataError:
     return DataError(f"the motion capture export lacks {lacking}", where=where, allowed=allowed, hint=hint)
 
 
-OTHER_JOINT_MESSAGE_TYPES = (
-    "franka_msgs/msg/FrankaState",
-    "franka_msgs/msg/FrankaRobotState",
-    "control_msgs/msg/DynamicJointState",
-    "control_msgs/msg/JointTrajectoryControllerState",
-    "ur_msgs/msg/RobotStateRTMsg",
-)
-"""Message types with joint values that can be read, other than JointState."""
-_UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ESTIMATED_WRENCH_GROUP_NAME = "wrist_estimated"
 """Recording group of the external wrench that a driver estimates from joint torques, in the frame that it states."""
-
-
-def joint_values_of_message(content: Any, kind: str) -> SimpleNamespace:
-    """Read joint names and values from a message of `OTHER_JOINT_MESSAGE_TYPES`. Absent channels are omitted.
-
-    If the driver estimates an external wrench, `wrench` has its frame and its `values` by quantity.
-    """
-    if kind == OTHER_JOINT_MESSAGE_TYPES[0]:
-        return _franka_state(content)
-    if kind == OTHER_JOINT_MESSAGE_TYPES[1]:
-        return _franka_robot_state(content)
-    if kind == OTHER_JOINT_MESSAGE_TYPES[2]:
-        return _dynamic_joint_state(content)
-    if kind == OTHER_JOINT_MESSAGE_TYPES[4]:
-        own = {"position": content.q_actual, "velocity": content.qd_actual, "position_command": content.q_target}
-        return _values([f"{name}_joint" for name in _UR_JOINTS], own)
-    measured = getattr(content, "feedback", None) or content.actual
-    wanted = getattr(content, "reference", None) or content.desired
-    own = {"position": measured.positions, "velocity": measured.velocities, "effort": measured.effort}
-    return _values(content.joint_names, own | {"position_command": wanted.positions})
+_UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 def joint_values_from_message_fields(content: Any, paths: Mapping[str, str], where: str) -> SimpleNamespace:
@@ -326,6 +298,34 @@ def _dynamic_joint_state(content: Any) -> SimpleNamespace:
     return _values(kept, {c: [values[c] for values in kept.values()] for c in channels})
 
 
+def _controller_state(content: Any) -> SimpleNamespace:
+    """Joint values of a message of ros2_control's trajectory controller."""
+    measured = getattr(content, "feedback", None) or content.actual
+    wanted = getattr(content, "reference", None) or content.desired
+    own = {"position": measured.positions, "velocity": measured.velocities, "effort": measured.effort}
+    return _values(content.joint_names, own | {"position_command": wanted.positions})
+
+
+def _ur_state(content: Any) -> SimpleNamespace:
+    """Joint values of a message of Universal Robots' driver."""
+    own = {"position": content.q_actual, "velocity": content.qd_actual, "position_command": content.q_target}
+    return _values([f"{name}_joint" for name in _UR_JOINTS], own)
+
+
 def _values(names: Any, values: Mapping[str, Any], wrench: SimpleNamespace | None = None) -> SimpleNamespace:
     own = {channel: np.asarray(array, float).ravel() for channel, array in values.items() if len(array)}
     return SimpleNamespace(frame="", name=[str(name) for name in names], wrench=wrench, **own)
+
+
+JOINT_VALUE_READERS: Mapping[str, Callable[[Any], SimpleNamespace]] = {
+    "franka_msgs/msg/FrankaState": _franka_state,
+    "franka_msgs/msg/FrankaRobotState": _franka_robot_state,
+    "control_msgs/msg/DynamicJointState": _dynamic_joint_state,
+    "control_msgs/msg/JointTrajectoryControllerState": _controller_state,
+    "ur_msgs/msg/RobotStateRTMsg": _ur_state,
+}
+"""Functions that read joint names and values from messages other than JointState, by message type.
+
+Absent channels are omitted. If the driver estimates an external wrench, `wrench` has its frame and its `values` by
+quantity.
+"""

@@ -275,7 +275,7 @@ class Recording(ReprMixin):
     @property
     def sensor_setting_keys(self) -> tuple[str, ...]:
         """Keys allowed under `sensors` in the settings for this recording, such as `joints.effort`."""
-        own = [key for key in CHANNEL_KINDS if self.joints is not None and CHANNEL_KINDS[key].group == "joints"]
+        own = [key for key, kind in CHANNEL_KINDS.items() if self.joints is not None and kind.group == "joints"]
         own += [group.name for group in self.points]
         own += [f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity]
         return tuple(own)

@@ -118,7 +118,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
         gain = {_GAIN: read_only_copy(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
-    further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
+    further = sorted({kind.group for kind in CHANNEL_KINDS.values()} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
         where, declared = f"{origin}: {name}", channel_specs_for_group_name(name)

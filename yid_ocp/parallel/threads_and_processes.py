@@ -16,6 +16,7 @@ from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from yid_ocp.display import grouped
 from yid_ocp.errors import ConfigError
 
 _THREADS_VARIABLE = "YID_OCP_THREADS"  # number of threads per process; default: the number of processors
@@ -134,10 +135,8 @@ class _March:
                 self.changed.wait_for(lambda: len(self.waiting) == self.live)
                 if not self.live:
                     return
-                groups: dict[Any, list[_Request]] = {}
-                for request in sorted(self.waiting, key=lambda request: request.rank):
-                    groups.setdefault(request.function, []).append(request)
-            for group in groups.values():
+                ordered = sorted(self.waiting, key=lambda request: request.rank)
+            for group in grouped((request.function, request) for request in ordered).values():
                 _answer(group)
 
     def abandon(self) -> None:
@@ -207,16 +206,13 @@ def map_with_merged_calls(
         finally:
             march.leave()
 
-    team = [threading.Thread(target=work, daemon=True) for _ in range(march.live)]
-    try:
-        for thread in team:
-            thread.start()
-        march.answer_until_done()
-    finally:
-        march.abandon()
-        for thread in team:
-            if thread.ident is not None:
-                thread.join()
+    with ThreadPoolExecutor(live) as team:
+        try:
+            for _ in range(live):
+                team.submit(work)
+            march.answer_until_done()
+        finally:
+            march.abandon()
     if errors:
         raise errors[min(errors)]
     return [results[index] for index in range(len(entries))]

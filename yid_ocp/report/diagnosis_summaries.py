@@ -23,6 +23,7 @@ from yid_ocp.effects import EFFECTS
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
+    SUMMARIES,
     CodeBlock,
     SummaryBlockOrTextIterator,
     SummaryStatement,
@@ -33,7 +34,6 @@ from yid_ocp.report.terminal import (
     large_torque_offsets_sentence,
     misfit_summary_blocks,
     next_steps_table,
-    register_summary,
     scale_and_unit_with_metres_as_mm,
     shown_unit,
     torque_offset_table,
@@ -54,7 +54,7 @@ _MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
-@register_summary("yid-diagnosis/2")
+@SUMMARIES.register("yid-diagnosis/2")
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
@@ -157,7 +157,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     return fitted, others
 
 
-@register_summary("yid-blind/1")
+@SUMMARIES.register("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     score, *others, cases = _blind_tables(result)
     yield from (SummaryStatement(text, "verdict") for text in _blind_sentences(result))
@@ -271,7 +271,7 @@ def _rate(own: Mapping[str, Any]) -> str:
     return f"{_share(own['rate'])} ({own['count']} of {own['of']}, {_share(own['low'])} to {_share(own['high'])})"
 
 
-@register_summary("yid-batch/1")
+@SUMMARIES.register("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
     told = (own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
@@ -318,7 +318,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
         yield entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time
 
 
-@register_summary("yid-compare/1")
+@SUMMARIES.register("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     methods, judged = result["methods"], result["judged"]
     runs = methods | {"best fit": judged}
@@ -400,7 +400,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
     yield "time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in entries)
 
 
-@register_summary("yid-friction/1")
+@SUMMARIES.register("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
     heads = ("error", "standard error", f"difference from '{best}'", "standard error of the difference", "note")
@@ -452,7 +452,7 @@ def _friction_constant_words(name: str, unit: str) -> str:
     return f"{known.get(symbol, 'viscous friction')} ({symbol}) [{unit}]".removesuffix(" [1]")
 
 
-@register_summary("yid-history/1")
+@SUMMARIES.register("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p-value", "verdict")]
@@ -505,7 +505,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"{text}. The ± of such a run includes the model error, but may still be too small."
 
 
-@register_summary("yid-overlay/1")
+@SUMMARIES.register("yid-overlay/1")
 def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     first, second = result["runs"]
     rows: TableRows = [("parameter", first, second, "difference", "difference / larger std", "unit")]
@@ -545,8 +545,8 @@ def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
     return "" if entry is None else f"{entry['value']:.4g} (fixed)"
 
 
-@register_summary("yid-export/1")
-def summarize_export(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+@SUMMARIES.register("yid-export/1")
+def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     listed = {

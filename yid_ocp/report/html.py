@@ -43,7 +43,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
     import jinja2
 
     # the template of a plug-in is next to its file
-    folders = {str(Path(inspect.getfile(REPORT_SECTIONS[name].prepare_context)).parent) for name in REPORT_SECTIONS}
+    folders = {str(Path(inspect.getfile(own.prepare_context)).parent) for own in REPORT_SECTIONS.values()}
     loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(folders))])
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

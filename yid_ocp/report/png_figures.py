@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
-from yid_ocp.errors import OutputError
+from yid_ocp.files import atomic_write
 from yid_ocp.report.figures import LINE_PALETTE, asymmetric_error_bars
 
 if TYPE_CHECKING:
@@ -80,11 +80,8 @@ def _draw_rates(
 
 
 def _save(figure: Figure, path: Path, dpi: int = 120) -> None:
-    try:
-        figure.savefig(path, dpi=dpi, format="png")
-    except OSError as error:
-        what, hint = f"the figure cannot be written: {error.strerror}", "choose another folder, or free disk space"
-        raise OutputError(what, where=str(path), hint=hint) from error
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")
 
 
 _STRUCTURAL_COLOR, _NONZERO_COLOR, _BLOCK_EDGE_COLOR = "#a9cfe0", LINE_PALETTE[0], LINE_PALETTE[1]

@@ -21,6 +21,7 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.report.terminal import (
     MAX_CHANNELS_SHOWN_SINGLY,
     MAX_NOISE_RATIO,
+    SUMMARIES,
     CodeBlock,
     SummaryBlockOrTextIterator,
     SummaryStatement,
@@ -34,7 +35,6 @@ from yid_ocp.report.terminal import (
     large_torque_offsets_sentence,
     misfit_summary_blocks,
     next_steps_table,
-    register_summary,
     scale_and_unit_with_metres_as_mm,
     shown_unit,
     torque_offset_table,
@@ -57,7 +57,7 @@ _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noi
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
-@register_summary("yid-solve/1")
+@SUMMARIES.register("yid-solve/1")
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     status = result["status"]
@@ -245,7 +245,7 @@ def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         yield f"{said} {remedy.format(own)}"
 
 
-@register_summary("yid-identifiability/1")
+@SUMMARIES.register("yid-identifiability/1")
 def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
@@ -340,7 +340,7 @@ def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[
             yield (", ".join(f"{name} {100 * changes[name]:+.3g} %" for name in named[:_MAX_CHANGES]),)
 
 
-@register_summary("yid-plan/1")
+@SUMMARIES.register("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
     done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
@@ -423,7 +423,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 
-@register_summary("yid-check/1")
+@SUMMARIES.register("yid-check/1")
 def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     warnings, coarse = result["warnings"], result["convergence"]["warnings"]
     severe, mild = (issue_descriptions(result, severe=own) for own in (True, False))
@@ -492,7 +492,7 @@ def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
             yield channel, std, offset * bool(known.get("bias_std")), source
 
 
-@register_summary("yid-inspect/1")
+@SUMMARIES.register("yid-inspect/1")
 def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
@@ -564,7 +564,7 @@ def _row_names_text(names: Sequence[str]) -> str:
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
 
 
-@register_summary("yid-simulate/1")
+@SUMMARIES.register("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if result["status"] == "failed":
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
@@ -578,7 +578,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield next_steps_table(result, {"estimate parameters from this recording": f"solve --set {shlex.quote(option)}"})
 
 
-@register_summary("yid-track/1")
+@SUMMARIES.register("yid-track/1")
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")

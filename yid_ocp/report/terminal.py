@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import re
 import shlex
@@ -17,6 +16,7 @@ from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording,
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
 from yid_ocp.display import abbreviated_names_text, grouped
 from yid_ocp.inference import uncertainty
+from yid_ocp.registry import Registry
 from yid_ocp.sensors.base import channel_specs_for_group_name
 
 if TYPE_CHECKING:
@@ -64,29 +64,16 @@ class CodeBlock:
 StatementTableOrCode = SummaryStatement | SummaryTable | CodeBlock
 SummaryBlockOrTextIterator = Iterator[StatementTableOrCode | str]
 """Blocks of a summary in their order. A string is a note; an empty string is omitted."""
-_Summary = Callable[[Mapping[str, Any]], list[StatementTableOrCode]]
-SUMMARY_BY_RESULT_FORMAT: dict[str, _Summary] = {}
-"""Functions that return the summary of a result, by result format such as `yid-solve/1`."""
+SUMMARIES: Registry[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]] = Registry("result format")
+"""Generators of the summary of a result, by its format such as `yid-solve/1`."""
 
 
-def register_summary(
-    result_format: str,
-) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]], _Summary]:
-    """Return a decorator that registers a generator as the summary of a result format, such as `yid-solve/1`.
-
-    The decorated function returns a list of blocks, without empty texts and tables that have only a header.
-    """
-
-    def enter(make: Callable[[Mapping[str, Any]], SummaryBlockOrTextIterator]) -> _Summary:
-        @functools.wraps(make)
-        def summary(result: Mapping[str, Any]) -> list[StatementTableOrCode]:
-            blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in make(result))
-            return [own for own in blocks if (len(own.rows) > 1 if isinstance(own, SummaryTable) else own.text)]
-
-        SUMMARY_BY_RESULT_FORMAT[result_format] = summary
-        return summary
-
-    return enter
+def summary_blocks(result: Mapping[str, Any]) -> list[StatementTableOrCode]:
+    """Return the summary of a result without empty texts and tables that have only a header. Empty without summary."""
+    form = str(result.get("format"))
+    parts = SUMMARIES[form](result) if form in SUMMARIES else ()
+    blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in parts)
+    return [own for own in blocks if (len(own.rows) > 1 if isinstance(own, SummaryTable) else own.text)]
 
 
 def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:

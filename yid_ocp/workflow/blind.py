@@ -159,11 +159,11 @@ class _Proof:
         """Return the commitment to the labels, and one diagnosis task per case; draw the cases if there are none."""
         file = self.folder / "commitment.json"
         configs = {entry.name: config_yaml_with_defaults(entry) for entry in self.runs}
-        if not file.exists():
-            self._draw(file, configs)
-        said = read_input_json(file)
         asked = {"cases": self.count, "seed": self.seed, "purpose": self.purpose, "configs": configs}
         asked["slice"] = "/".join(map(str, self.part))
+        if not file.exists():
+            write_strict_json(file, asked | {"sha256": self._draw(configs), "code": package_source_hash()})
+        said = read_input_json(file)
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
             hint = "choose another --out, or the same configurations, --cases, --seed, --slice and --calibration"
@@ -181,7 +181,8 @@ class _Proof:
             tasks.append(Task(own["name"], own))
         return said, tasks
 
-    def _draw(self, commitment: Path, configs: Mapping[str, str]) -> None:
+    def _draw(self, configs: Mapping[str, str]) -> str:
+        """Draw the cases, and return the hash of their labels."""
         cases, prepared = self.folder / "cases", self.whole / "prepared"
         for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
             make_folder(part)
@@ -211,9 +212,7 @@ class _Proof:
         text, digest = blind.labels_json_and_sha256([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
         write_strict_json(cases / "cases.json", [entry["case"] for entry in made])
-        said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
-        said["slice"] = f"{own}/{of}"
-        write_strict_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
+        return digest
 
     def best_closures(
         self, cases: Sequence[Task], labels: Sequence[blind.CaseGroundTruth], answers: Sequence[Mapping[str, Any]]

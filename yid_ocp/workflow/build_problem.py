@@ -242,11 +242,11 @@ def _check_recordings(
             issues += found
             if any(issue.severity == "refused" for issue in found):
                 continue
-            parts = split_recording_at_gaps(recording, clamped, anywhere)
-            issues += parts.issues
-            for part in parts.recordings:
+            parts, doubts = split_recording_at_gaps(recording, clamped, anywhere)
+            issues += doubts
+            for part in parts:
                 issues += _beside_the_model(run, system, arm, cable, part)
-            role += parts.recordings
+            role += parts
     if arm is not None:
         issues += _excitation(run, arm, free, kept[0])
     issues = _without_repeated_warnings(issues)

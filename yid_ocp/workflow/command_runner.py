@@ -20,7 +20,7 @@ from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
-from yid_ocp.report.terminal import SUMMARY_BY_RESULT_FORMAT, aligned_table_lines, summary_terminal_lines
+from yid_ocp.report.terminal import aligned_table_lines, summary_blocks, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -59,8 +59,7 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
         outcome = work(progress)
     path, near, result = str(outcome.folder), os.path.relpath(outcome.folder), outcome.result
     place = path if near.startswith("..") else f"run folder: {near}"
-    summary = SUMMARY_BY_RESULT_FORMAT[result["format"]]
-    print_result(arguments, result, lambda: summary_terminal_lines(summary(result)), place, path)
+    print_result(arguments, result, lambda: summary_terminal_lines(summary_blocks(result)), place, path)
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 

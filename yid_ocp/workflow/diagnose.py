@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import logging
 import os
 import threading
@@ -132,7 +131,7 @@ def run_diagnose(
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
-    refits.delete_file()
+    folder.delete_resume_data(*folder.resume_folder.glob("*refits.json*"))  # also temporary copies
     return CommandOutcome(folder.path, written, finding)
 
 
@@ -339,13 +338,6 @@ class _SingleJsonFileRefitStore(RefitStore):
                 if not self._warned:
                     log.warning("Finished refits cannot be stored (%s), so an interruption would lose them", error)
                 self._warned = True
-
-    def delete_file(self) -> None:
-        """Delete the file, its temporary copies and its folder if empty."""
-        with contextlib.suppress(OSError):
-            for file in self.file.parent.glob(f"*{self.file.name}*"):
-                file.unlink()
-            self.file.parent.rmdir()
 
     def _read(self) -> dict[str, StoredFit]:
         if not self.file.exists():

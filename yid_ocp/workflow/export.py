@@ -30,8 +30,7 @@ from yid_ocp.export.signals import (
 )
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
-from yid_ocp.report.diagnosis_summaries import summarize_export
-from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
+from yid_ocp.report.terminal import recording_summary_lines, summary_blocks, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import ReplayErrorAgainstRecording, replay_mismatch_by_channel
@@ -66,7 +65,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
-        blocks = summarize_export(manifest)
+        blocks = summary_blocks(manifest)
         print_result(arguments, manifest, lambda: summary_terminal_lines(blocks), f"model: {out}", out)
         return EXIT_DONE
     if not source.is_dir() and form not in (None, "csv", _MCAP):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -139,9 +137,7 @@ def run_identifiability(
         folder.log_event("end", status=result["status"], message=result["message"])
         written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
     if tasks is not None:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(tasks.results_folder)
-            tasks.results_folder.parent.rmdir()
+        folder.delete_resume_data(tasks.results_folder)
     return CommandOutcome(folder.path, written, information, information is not None)
 
 

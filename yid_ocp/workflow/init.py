@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shlex
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import chain
@@ -328,14 +329,8 @@ def _number_or_numbers_by_name(value: float | Mapping[str, float]) -> str:
 
 def _wrapped_list(values: Iterable[str], column: int) -> str:
     """Return a YAML list; a long one has several lines, which begin at `column`."""
-    rows, row = [], ""
-    for value in map(_value, values):
-        if row and len(row) + len(value) > 90:
-            rows.append(row)
-            row = ""
-        row += f"{value}, "
-    rows.append(row)
-    return "[" + f",\n{' ' * column}".join(entry.rstrip(", ") for entry in rows) + "]"
+    rows = textwrap.wrap(", ".join(map(_value, values)), 91, break_long_words=False, break_on_hyphens=False)
+    return "[" + f"\n{' ' * column}".join(rows) + "]"
 
 
 def _of_object(item: InitialObjectSettings, proposal: ProposedConfigChoices) -> dict[str, Any]:

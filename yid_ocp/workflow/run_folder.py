@@ -92,6 +92,16 @@ class RunFolder:
             self._log.write(json.dumps(to_json_types(line), allow_nan=False) + "\n")
             self._log.flush()
 
+    def delete_resume_data(self, *paths: Path) -> None:
+        """Delete files and folders of `resume_folder`, and this folder if nothing else is in it."""
+        with contextlib.suppress(OSError):
+            for path in paths:
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            self.resume_folder.rmdir()
+
 
 class _Lines(logging.Handler):
     def __init__(self, folder: RunFolder) -> None:

@@ -73,11 +73,7 @@ def _run(path: Path, name: str) -> None:
         raise ImportError("the file is not a Python module")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look for the module of their class
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
+    spec.loader.exec_module(module)
 
 
 @contextlib.contextmanager
@@ -94,10 +90,13 @@ def _registering(
         if all(set(registry) == names for registry, names in zip(registries, before, strict=True)) and not known:
             allowed = "@EFFECTS.register(NAME), or another decorator that docs/howto/extending.md describes"
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed, hint="add a decorator")
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         for registry, names in zip(registries, before, strict=True):
-            registry.unregister_names(set(registry) - names)
+            for own in set(registry) - names:
+                del registry[own]
         sys.modules.pop(module, None)
+        if not isinstance(error, (Exception, SystemExit)):
+            raise
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error

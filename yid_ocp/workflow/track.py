@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -72,7 +70,7 @@ def _run_track(
                 except DataError as error:
                     refused = error
         except YidError as error:
-            tasks.delete_files()
+            folder.delete_resume_data(*tasks.resume_files)
             if made is not None and str(folder.resume_folder) in error.where:  # rendered frames, which are not kept
                 error.where = run.setting_location("track", "virtual_frames")
             raise
@@ -99,7 +97,7 @@ def _run_track(
         drawn = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in drawn if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
-        tasks.delete_files()
+        folder.delete_resume_data(*tasks.resume_files)
     if refused is not None:
         hint = f"{refused.hint}. All reasons, and pictures of readable frames, are in {folder.path}"
         where = refused.where if made is None else run.setting_location("track", "virtual_frames")
@@ -252,7 +250,7 @@ class _FrameTasks:
     settings: RunSettings
     work_folder: Path
     input_hashes: dict[str, str]
-    own_files: tuple[Path, ...] = ()
+    resume_files: tuple[Path, ...]  # to delete at the end
 
     def estimate_shared_values(self) -> SequenceEstimates:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
@@ -289,15 +287,6 @@ class _FrameTasks:
         listed = [Task(name, {**common, **own}) for name, own in tasks.items()]
         return run_tasks(function, listed, self.work_folder / _RESULTS_FOLDER, workers, report)
 
-    def delete_files(self) -> None:
-        for path in (*self.own_files, self.work_folder):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            self.work_folder.parent.rmdir()
-
 
 def _frame_tasks(
     run: RunSettings, system: System, folder: RunFolder, progress: Progress
@@ -331,7 +320,7 @@ def _frame_tasks(
         files.write_text(work_folder / _CONFIG_FILE, text)
     if said.frames_path is not None:
         folder.input_hashes[said.frames_path] = inputs["frames"]
-    return _FrameTasks(own, work_folder, inputs, own_files), made
+    return _FrameTasks(own, work_folder, inputs, (*own_files, work_folder)), made
 
 
 def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:

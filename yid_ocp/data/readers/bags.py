@@ -17,9 +17,8 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.foreign_formats import (
     ESTIMATED_WRENCH_GROUP_NAME,
-    OTHER_JOINT_MESSAGE_TYPES,
+    JOINT_VALUE_READERS,
     joint_values_from_message_fields,
-    joint_values_of_message,
 )
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
@@ -36,7 +35,7 @@ _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _PLACES = (_POINT_STAMPED, *_POSES, _POSE_ARRAY)
 _WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
 _GROUP_BY_MESSAGE_TYPE = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
-_JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *OTHER_JOINT_MESSAGE_TYPES)
+_JOINT_TYPES = (JOINT_STATE_MESSAGE_TYPE, *JOINT_VALUE_READERS)
 _KNOWN = (*_JOINT_TYPES, *_PLACES, *_GROUP_BY_MESSAGE_TYPE)
 # last parts of topics that name a message type, not the measured object
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
@@ -228,7 +227,6 @@ def _read_bag(
 
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
     path = Path(path)
-    file_sha256(path)
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
@@ -311,7 +309,7 @@ def _topic_and_paths(bag: OpenBag, fields: Mapping[str, str]) -> tuple[str, dict
 
 def _default_joint_topics(bag: OpenBag) -> list[str]:
     """Topics of joint states or, without any, of other messages with joints."""
-    return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*OTHER_JOINT_MESSAGE_TYPES)
+    return bag.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE) or bag.topic_names_of_types(*JOINT_VALUE_READERS)
 
 
 def _stamp(content: Any) -> int:
@@ -320,8 +318,8 @@ def _stamp(content: Any) -> int:
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
-    if kind in OTHER_JOINT_MESSAGE_TYPES:
-        return joint_values_of_message(content, kind)
+    if kind in JOINT_VALUE_READERS:
+        return JOINT_VALUE_READERS[kind](content)
     frame = str(content.header.frame_id)
     if kind == JOINT_STATE_MESSAGE_TYPE:
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
@@ -563,7 +561,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
     becomes, note = "", f"its type is not known. For joint values, add --field position={topic.name}.FIELD"
-    if topic.kind in OTHER_JOINT_MESSAGE_TYPES and topic.name not in _default_joint_topics(bag.file):
+    if topic.kind in JOINT_VALUE_READERS and topic.name not in _default_joint_topics(bag.file):
         note = f"joints, left out because the bag has joint states. To use them, add --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))

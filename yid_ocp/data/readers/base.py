@@ -71,7 +71,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
         if equals:
             _set_unit(exact, quantity.strip(), unit)
             continue
-        of = next((si for si, known in _TO_SI.items() if _spaceless(unit) in map(_spaceless, known)), None)
+        of = next((si for si, known in _TO_SI.items() if unit in known), None)
         if of is None:
             every = ", ".join(dict.fromkeys(chain(*_TO_SI.values())))  # metres are units of two quantities
             hint = "write the units of the file's values, such as --units deg,mm, or convert the values"
@@ -88,10 +88,6 @@ def _set_unit(units: dict[str, str], quantity: str, unit: str) -> None:
         raise DataError(what, where="--units", allowed="one unit for every quantity", hint=hint)
 
 
-def _spaceless(unit: str) -> str:
-    return unit.replace(" ", "")
-
-
 def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, float]:
     """Return the factor from the file's unit to the SI unit for every quantity; to ampere for a motor current."""
     factors = dict.fromkeys(_QUANTITIES, 1.0)
@@ -102,11 +98,11 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
             hint = f"name the quantity: '{unit}' fits {fitting}" if fitting else "write for example position=deg"
             said = unknown_name_error_arguments(quantity, _QUANTITIES, hint)
             raise DataError(what, where=f"--units, for {where}", **said)
-        known = {_spaceless(name): factor for name, factor in _TO_SI.get(_QUANTITIES[quantity], {}).items()}
-        if _spaceless(unit) not in known:
-            what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI.get(_QUANTITIES[quantity], ()))
-            raise DataError(what, where=where, **unknown_name_error_arguments(unit, names))
-        factors[quantity] = known[_spaceless(unit)]
+        known, plain = _TO_SI.get(_QUANTITIES[quantity], {}), UNIT_BY_WORD.get(unit.lower(), unit)
+        if plain not in known:
+            what = f"'{unit}' is not a unit of '{quantity}'"
+            raise DataError(what, where=where, **unknown_name_error_arguments(unit, known))
+        factors[quantity] = known[plain]
     return factors
 
 
@@ -202,7 +198,7 @@ def _torque_factors(names: Sequence[str], options: JointPointAndUnitOptions, whe
             if not (math.isfinite(value) and value != 0):
                 what, allowed = f"the {word} of '{pattern}' is {value:g}", "a finite number that is not zero"
                 raise DataError(what, where=where, allowed=allowed, hint=f"write for example {pattern}=0.1")
-    if _spaceless((options.units or {}).get("effort", "")) not in MOTOR_CURRENT_UNITS:
+    if (options.units or {}).get("effort") not in MOTOR_CURRENT_UNITS:
         if constants or gear_ratios:
             what = "torque constants or gear ratios are given, but the unit of the efforts is not a unit of current"
             allowed = "torque constants and gear ratios with --units effort=A or effort=mA"

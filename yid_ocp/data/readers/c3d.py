@@ -66,7 +66,6 @@ def _read_c3d(
 @base.FILE_PREVIEWERS.register(".c3d")
 def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
     path = Path(path)
-    file_sha256(path)
     found = _markers(path)
     rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
     sources = []

@@ -40,7 +40,7 @@ from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
 
-_VECTORS = [kind for key in CHANNEL_KINDS if (kind := CHANNEL_KINDS[key]).components and kind.group != "points"]
+_VECTORS = [kind for kind in CHANNEL_KINDS.values() if kind.components and kind.group != "points"]
 _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _VECTORS for axis in channel.components)
 """Components of vectors measured by sensors on a link, such as `force_x`."""
 _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
@@ -163,7 +163,6 @@ def _mounted_sensors(
 
 def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     path = Path(path)
-    file_sha256(path)
     if (capture := _mocap_table(path)) is not None:
         group, _, remarks = capture
         count, rate = np.isfinite(group.position).all(axis=2).sum(axis=0), mean_sample_rate(group.t)

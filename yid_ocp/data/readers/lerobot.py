@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +32,7 @@ _VERSIONS = ("v2.0", "v2.1", "v3.0")
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # numbers of frames and tasks
 _NEVER_RADIANS = re.compile(r"(so_?100|so_?101|koch|lekiwi|omx|hope_?jr)", re.IGNORECASE)
 """Types of robots that LeRobot records in degrees or in normalised units, -100 to 100 of the calibrated range."""
+_EPISODE_PATH = re.compile(r"(?![/\\])([^{}]|\{episode_(chunk|index)(:0?\d\d?d)?\})+")  # without a leading slash
 _MAX_RADIANS, _MAX_NORMALISED = 2.1 * math.pi, 100.5
 _PERCENT = "recorded as 0 to 100 % of its calibrated range, not as an angle"
 
@@ -199,17 +199,11 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
     """Tables that may contain an episode: its own one in version 2, any in version 3."""
-    pattern, numbers = dataset.info.data_path, {"episode_chunk": 0, "episode_index": episode}
+    pattern, chunk = dataset.info.data_path, episode // (dataset.info.chunks_size or 1000)
     if "episode_index" not in pattern:
         return sorted(dataset.folder.glob("data/*/*.parquet"))
-    numbers["episode_chunk"] = episode // (dataset.info.chunks_size or 1000)
-    try:
-        fields = [entry for entry in string.Formatter().parse(pattern) if entry[1] is not None]
-        known = all(name in numbers and re.fullmatch(r"(0?\d\d?d)?", form or "") for _, name, form, _ in fields)
-        if known and not any(convert for *_, convert in fields) and ".." not in pattern and pattern[0] not in "/\\":
-            return [dataset.folder / pattern.format(**numbers)]
-    except ValueError:  # braces that do not match
-        pass
+    if _EPISODE_PATH.fullmatch(pattern) and ".." not in pattern:
+        return [dataset.folder / pattern.format(episode_chunk=chunk, episode_index=episode)]
     where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
     allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
     hint = "write data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"

@@ -83,8 +83,7 @@ def draw_figure_per_unit(
 def rendered_section_dicts(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:
     """Return all sections that have content, in order, each with the keys `name`, `title` and `html`."""
     result = []
-    sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
-    for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):
+    for name, section in sorted(REPORT_SECTIONS.items(), key=lambda entry: entry[1].order):
         context = section.prepare_context(findings)
         if not isinstance(context, Mapping):
             figures = [*(context or ())]

@@ -16,6 +16,7 @@ from yid_ocp.inference.null_test import channels_with_residual_indices
 from yid_ocp.inference.smoother import SmoothedUnknownsResult, smoothed_unknown_units, smoothed_unknown_z_scores
 from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section
@@ -285,19 +286,16 @@ def _curves(
     labels = (_NOMINAL_LABEL, _EXTENDED_LABEL) if changed else (_NOMINAL_LABEL,)
     found: list[tuple[float, str, tuple[TimePlotData, TimePlotData]]] = []
     for episode, *outcomes in predicted:
-        for k, samples in enumerate(episode.measurements):
-            sensor = samples.sensor
-            t = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
-            for column, channel in enumerate(samples.channel_name_per_output):
-                y, std = samples.value[:, column], samples.std[:, column]
-                own = (outcome.predicted_outputs[k][:, column] for outcome in outcomes)
-                lines = dict(zip(labels, own, strict=False))
+        for parts in zip(*(channel_predictions(episode, outcome) for outcome in outcomes), strict=True):
+            own = parts[0]
+            for i, axis in enumerate(("x", "y", "z") if own.measured.shape[1] == 3 else ("",)):
+                y, std = own.measured[:, i], own.noise_std[:, i]
+                lines = {label: part.predicted[:, i] for label, part in zip(labels, parts, strict=False)}
                 seen = np.isfinite(y) & np.isfinite(std)
                 if seen.any():
                     squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
-                    part = sensor.output_names[column].removeprefix(channel).lstrip(".")
-                    name = f"{channel}, {part}" if part else channel
-                    pair = figures.channel_prediction_and_residual_plot_data(name, sensor.unit, t, y, std, lines)
+                    name = f"{own.channel}, {axis}" if axis else own.channel
+                    pair = figures.channel_prediction_and_residual_plot_data(name, own.unit, own.t, y, std, lines)
                     found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, pair))
     if not found:
         return None

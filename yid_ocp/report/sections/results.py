@@ -33,7 +33,6 @@ _ESTIMATE_COLORS = {"start": figures.MEASURED_COLOR, "estimate": figures.LINE_PA
 _ESTIMATE_COLORS |= {"estimate that cannot be trusted": figures.LINE_PALETTE[1]}
 _ESTIMATED, _HELD_OUT = "estimated on", "held out"
 _JOINT_CHANNELS = ("position", "velocity", "effort", "position_command")
-_PRISMATIC_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}  # by the unit of a revolute joint
 
 
 @register_report_section("verdict", 0, "What was found")
@@ -52,8 +51,7 @@ def _result_blocks(
     findings: ReportData,
 ) -> tuple[list[str], list[terminal.StatementTableOrCode], list[terminal.StatementTableOrCode]]:
     """Return conclusions and verdicts of a result, and its other blocks up to the key table and after it."""
-    known = terminal.SUMMARY_BY_RESULT_FORMAT.get(str(findings.result.get("format")))
-    blocks = [] if known is None else known(findings.result)
+    blocks = terminal.summary_blocks(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, terminal.SummaryTable) and block.is_key_table)
     end = next(ends, 0)
     told = [block for block in blocks if isinstance(block, terminal.SummaryStatement) and block.kind != "note"]
@@ -185,10 +183,9 @@ def _lines(t: Array, names: Sequence[str], values: Array) -> dict[str, tuple[Arr
 
 def _joint_channel_unit(system: System | None, names: Sequence[str], channel: str) -> str:
     """Return the unit of a joint channel (two for mixed kinds). Joints unknown to the system count as revolute."""
-    kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
-    is_prismatic = {kinds.get(name) == "prismatic" for name in names} or {False}
-    unit = JOINT_CHANNEL_UNITS[channel]
-    return ", ".join(_PRISMATIC_UNITS[unit] if kind else unit for kind in sorted(is_prismatic))
+    revolute = JOINT_CHANNEL_UNITS[channel]
+    units = {} if system is None else {joint.name: joint.unit(revolute) for joint in system.mechanism.joints}
+    return ", ".join(sorted({units.get(name, revolute) for name in names}, key=lambda unit: unit != revolute))
 
 
 class _PredictedEpisode(NamedTuple):
