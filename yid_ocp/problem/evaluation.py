@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
     huber_loss_and_sqrt_weights,
-    whiten_against_sensor_biases,
+    whiten_with_extra_errors,
     whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import ProblemOptions
@@ -122,7 +122,7 @@ def episode_residual_and_jacobian(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold.
+    Constant sensor errors count as noise (`whiten_with_extra_errors`). `threshold` is the Huber threshold.
     """
     by_constants = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
@@ -138,7 +138,7 @@ def episode_residual_and_jacobian(
         innovations, _ = whitening.whiten_residuals_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
-        columns = whiten_against_sensor_biases(by_constants, columns)
+        columns = whiten_with_extra_errors(columns, by_constants)
     cost, factor = huber_loss_and_sqrt_weights(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

@@ -272,14 +272,14 @@ def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, A
     return float(np.sum(cost)), np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
 
 
-def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Add constant sensor errors of known variance to the noise by which a residual and its derivatives are whitened.
+def whiten_with_extra_errors(columns: Array, spread: Array) -> Array:
+    """Return (I + F F')^(-1/2) X, which whitens rows X of unit covariance for k further, independent errors.
 
-    The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
-    derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation.
+    X (nr,) or (nr, c) is `columns`, a residual and its derivatives. F (nr, k) is `spread`; column j, if finite, is the
+    change of the residual by one std of error j.
     """
-    left, size, _ = np.linalg.svd(slopes, full_matrices=False)
-    return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
+    left, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
+    return np.asarray(columns + (left * (1 / np.hypot(1.0, sizes) - 1)) @ (left.T @ columns))
 
 
 def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
