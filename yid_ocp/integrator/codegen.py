@@ -361,7 +361,9 @@ def _simd_c_source(functions: Sequence[ca.Function]) -> str | None:
 
 
 @dataclass(frozen=True)
-class _Instruction:
+class ResolvedInstruction:
+    """One instruction of a CasADi function."""
+
     code: int
     inputs: list[int]  # argument and entry, or the instructions whose values it takes
     outputs: list[int]  # the place of CasADi's work vector, or result and entry
@@ -369,7 +371,7 @@ class _Instruction:
 
 
 def _source(function: ca.Function) -> str | None:
-    instructions = _instructions(function)
+    instructions = resolved_instructions(function)
     if any(instruction.code not in _TRANSLATED_OPERATIONS for instruction in instructions):
         return None
     size = _PART_INSTRUCTION_COUNT if _is_long_function(function) else max(len(instructions), 1)
@@ -387,23 +389,23 @@ def _source(function: ca.Function) -> str | None:
     return "\n".join([*written, f"static void {name}({signature}) {{", *calls, "}"])
 
 
-def _instructions(function: ca.Function) -> list[_Instruction]:
-    """Instructions of a function, in order. Inputs of an operation without a SIMD form are not resolved."""
+def resolved_instructions(function: ca.Function) -> list[ResolvedInstruction]:
+    """Return the instructions of a function of SX expressions, in order, each with the instructions that it uses."""
     held: dict[int, int] = {}  # the instruction whose value stands in a place now
     found = []
     for k in range(function.n_instructions()):
         code, inputs = function.instruction_id(k), function.instruction_input(k)
         outputs = function.instruction_output(k)
-        if code in _TRANSLATED_OPERATIONS and code != ca.OP_INPUT:
+        if code not in (ca.OP_INPUT, ca.OP_PARAMETER):
             inputs = [held[place] for place in inputs]
         constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
-        found.append(_Instruction(code, inputs, outputs, constant))
+        found.append(ResolvedInstruction(code, inputs, outputs, constant))
         if code != ca.OP_OUTPUT:
             held.update(dict.fromkeys(outputs, k))
     return found
 
 
-def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
+def _part(instructions: Sequence[ResolvedInstruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
     """C lines of some instructions. Values that later parts need are written to the work vector."""
     lines: list[str] = []
     known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector
