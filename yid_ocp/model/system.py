@@ -63,17 +63,27 @@ class Grasp:
         """The names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
+    def grasped_point_frames(self, mechanism: Mechanism) -> tuple[Frame, Frame]:
+        """Return the frames of holder and held link whose origins coincide in the grasp, and whose axes it aligns."""
+        slipped = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -self.axial_slip))
+        holder, held = mechanism.frame(self.holder_frame), mechanism.frame(self.held_frame)
+        local = Placement(self.held_orientation, self.holder_offset)
+        return Frame(holder.joint_index, holder.placement @ local), Frame(held.joint_index, held.placement @ slipped)
+
+    def orientation_products(self, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
+        """Return for each orientation equation the pairs of vectors (of holder, held) whose dot products sum to it."""
+        frames = self.grasped_point_frames(kinematics.mechanism)
+        a, b = (ca.horzsplit(kinematics.frame_pose(frame).rotation) for frame in frames)
+        if self.kind == "axis":
+            return [[(a[0], b[2])], [(a[1], b[2])]]
+        turns = ((2, 1), (0, 2), (1, 0)) if self.kind == "weld" else ()
+        return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in turns]
+
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Return the constraint residual phi(q), holder minus held, a column: position [m], then orientation [rad]."""
-        holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
-        held = kinematics.frame_pose(self.held_frame)
-        rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
-        if self.kind == "axis":
-            rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
-        elif self.kind == "weld":
-            error = holder.rotation.T @ held.rotation
-            rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
-        return ca.vertcat(*rows)
+        holder, held = map(kinematics.frame_position, self.grasped_point_frames(kinematics.mechanism))
+        rows = (sum((ca.dot(a, b) for a, b in pairs), ca.SX(0)) for pairs in self.orientation_products(kinematics))
+        return ca.vertcat(holder - held, *rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
         """Return the holder's axes minus the held axes (0, 3 or 9 rows), which is not zero for opposite axes."""
