@@ -129,8 +129,6 @@ class DiscreteEquations:
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
         """The constraint violation phi(q_{k+1}) - C lam / h (m, 1) at the end of the step, without relaxation."""
-        if self.constraint_relaxation_gain is None:
-            return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
@@ -283,11 +281,11 @@ def _constraint(system: System, at: _Symbols, middle: Kinematics) -> tuple[ca.SX
         return ca.substitute([residual], [at.qm, at.internal], [q, z])[0]
 
     closure, gain = phi(at.q1, at.z1), None
-    relaxation = system.constraint_relaxation_times()
-    if relaxation is not None:
-        gain = 1 + relaxation / at.h
+    grasp_of_row = [grasp for grasp in system.grasps for _ in range(grasp.n_constraint_equations)]
+    if not all(grasp.relaxation_time.is_zero() for grasp in grasp_of_row):
+        gain = 1 + ca.vertcat(*(grasp.relaxation_time for grasp in grasp_of_row)) / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    compliances = (grasp.compliance for grasp in system.grasps for _ in range(grasp.n_constraint_equations))
+    compliances = (grasp.compliance for grasp in grasp_of_row)
     return ca.densify(closure - ca.vertcat(ca.SX(0, 1), *compliances) * at.lam / at.h), gain
 
 

@@ -50,7 +50,7 @@ class Grasp:
     """Distance by which the grasped point has slipped along the object's z axis [m]."""
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
     """C in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h [m/N]; zero if rigid."""
-    relaxation_time: ca.SX | None = None
+    relaxation_time: ca.SX = field(default_factory=lambda: ca.SX(0))
     """T in the equation of `compliance` [s]."""
 
     @property
@@ -447,13 +447,6 @@ class System(ReprMixin):
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Return the constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
-
-    def constraint_relaxation_times(self) -> ca.SX | None:
-        """Return the relaxation times T (m, 1) [s] in phi + T dphi/dt = C lam / h. None if no grasp has one."""
-        if all(grasp.relaxation_time is None for grasp in self.grasps):
-            return None
-        times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
-        return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
 
 def _check_names(

@@ -107,7 +107,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
         "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
         "gravity": (system.gravity,),
         "grasp": (part for grasp in held for part in (grasp.held_orientation, grasp.holder_offset, grasp.axial_slip)),
-        "grasp_compliance": (part for g in held for part in (g.compliance, g.relaxation_time) if part is not None),
+        "grasp_compliance": (part for grasp in held for part in (grasp.compliance, grasp.relaxation_time)),
         "sprung_joint": system.joint_compliances.values(),
         "servo": (
             part
@@ -381,7 +381,7 @@ def _add_grasps(system: System, value: CasadiEvaluator, root: Element, time_step
         compliance = float(value(grasp.compliance)[0])
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
-            relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
+            relaxation = float(value(grasp.relaxation_time)[0])
             tendons = root.find("tendon")
             tendons = SubElement(root, "tendon") if tendons is None else tendons
             spring = SubElement(tendons, "spatial", name=f"grasp_{grasp.name}", springlength="0")
