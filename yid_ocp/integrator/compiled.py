@@ -70,7 +70,7 @@ _Linearization = _struct(
     "Linearization", "pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta"
 )
 _StepMaps = _struct("StepMaps", "int inputs loads", "pointer torque on_rows on_p1 after effort")
-_Outcome = _struct("Outcome", "int step status", "double error", "long iterations factorisations memory")
+_Outcome = _struct("Outcome", "int step status", "double error", "long iterations memory")
 
 
 def _filled(kind: type[_Struct], *values: object) -> _Struct:
@@ -186,7 +186,7 @@ class CompiledKernel:
         filled = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
-        ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
+        ends = ((o.status, o.step, o.error, o.iterations) for o in outcomes)
         return [attach_status_to_rollout(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(
