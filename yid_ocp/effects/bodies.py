@@ -67,7 +67,7 @@ class _Density(_ScaledBodies):
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
     tree = system.mechanism
-    return tuple(name for name in base.arm_joint_names(system) if tree.joints[tree.joint_index(name)].bodies)
+    return tuple(name for name in base.arm_joint_names(system) if tree.joint(name).bodies)
 
 
 @EFFECTS.register("link_mass")

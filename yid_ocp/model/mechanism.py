@@ -157,6 +157,10 @@ class Mechanism(ReprMixin):
         require_known_names([name], names, "joint", f"model '{self.name}'", ModelError)
         return names.index(name)
 
+    def joint(self, name: str) -> Joint:
+        """Return a joint by name. Raises `ModelError`, with the nearest name, if there is no such joint."""
+        return self.joints[self.joint_index(name)]
+
     def has_frame(self, name: str) -> bool:
         """Check whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)

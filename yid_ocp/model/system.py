@@ -301,7 +301,7 @@ class System(ReprMixin):
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
         wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        damped = {name: tree.joints[tree.joint_index(name)] for name in wanted}  # unknown joints raise `ModelError`
+        damped = {name: tree.joint(name) for name in wanted}  # unknown joints raise `ModelError`
         dampers = {
             n: Parameter(f"{n}.damping", wanted[n], joint.unit("N m s/rad"), 0.0, math.inf, f"damping of {n}")
             for n, joint in damped.items()
