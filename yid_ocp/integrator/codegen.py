@@ -306,13 +306,9 @@ def rows_and_columns_of_nonzeros(sparsity: ca.Sparsity) -> tuple[IntArray, IntAr
 
 def _runs(entries: _Indices) -> list[int]:
     """First number and last number + 1 of every run of consecutive numbers, in one list."""
-    result: list[int] = []
-    for value in map(int, entries):
-        if result and value == result[-1]:
-            result[-1] = value + 1
-        else:
-            result += [value, value + 1]
-    return result
+    values = np.array(entries, int)
+    runs = np.split(values, np.flatnonzero(np.diff(values) != 1) + 1)
+    return [bound for run in runs if len(run) for bound in (int(run[0]), int(run[-1]) + 1)]
 
 
 # libm's functions of one member after another

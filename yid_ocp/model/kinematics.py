@@ -42,6 +42,15 @@ class Kinematics:
         """Return the Jacobian (3, n) of a frame's angular velocity, in world axes, with respect to the joint rates."""
         return self._columns(frame, lambda screw: screw[:3])
 
+    def joint_velocities_and_screw_rates(self, v: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
+        """Return each joint's spatial velocity V_j and the rate D_j = V_parent x S_j of its screw, each (6, 1)."""
+        velocities, rates = list[ca.SX](), list[ca.SX]()
+        for j, joint in enumerate(self.mechanism.joints):
+            above = velocities[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
+            rates.append(motion_cross_motion_product(above, self.joint_screws[j]))
+            velocities.append(above + self.joint_screws[j] * v[j])
+        return velocities, rates
+
     def _frame(self, frame: str | Frame) -> Frame:
         return self.mechanism.frame(frame) if isinstance(frame, str) else frame
 
@@ -110,12 +119,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
     """Compute the first derivatives of the bodies' Lagrangian at joint velocities v (n, 1) and gravity (3, 1)."""
-    joints, S = kinematics.mechanism.joints, kinematics.joint_screws
-    velocity, D = list[ca.SX](), list[ca.SX]()
-    for j, joint in enumerate(joints):
-        above = velocity[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
-        D.append(motion_cross_motion_product(above, S[j]) if joint.parent_index >= 0 else above)
-        velocity.append(above + S[j] * v[j])
+    S, (velocity, D) = kinematics.joint_screws, kinematics.joint_velocities_and_screw_rates(v)
     moved, potential_energy = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
     for j, part in enumerate(moved):
