@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ class _CarriedBody(NamedTuple):
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:
     """Nominal mass properties of the bodies on a joint's moving side, in its frame. Without bodies the mass is zero."""
-    whole = merge_inertias([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
+    whole = merge_inertias([replace(body, gravity_fraction=ca.SX(1)) for body in system.mechanism.joints[joint].bodies])
     if whole is None:
         return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
     parameters = system.parameters
@@ -308,12 +308,10 @@ class _GravityScale(EffectBase):
 
     def apply_to_system(self, system: System) -> System:
 
-        def scaled(body: Inertia) -> Inertia:
-            nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
-            return replace(body, gravity_fraction=nominal + self["fraction"])
+        def scaled(bodies: tuple[Inertia, ...]) -> Iterator[Inertia]:
+            return (replace(body, gravity_fraction=body.gravity_fraction + self["fraction"]) for body in bodies)
 
-        joints = base.object_joint_names(system)
-        return base.system_with_changed_bodies(system, joints, lambda bodies: map(scaled, bodies))
+        return base.system_with_changed_bodies(system, base.object_joint_names(system), scaled)
 
 
 @EFFECTS.register("gravity_tilt")

@@ -163,14 +163,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     moved = [_Moved() for _ in joints]
     potential_energy = ca.SX(0)
     # if a body's weight is not mass times gravity, weights are summed separately from inertia
-    apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
+    apart = any(not body.gravity_fraction.is_one() for joint in joints for body in joint.bodies)
     for j, joint in enumerate(joints):
         for body in joint.bodies:
             com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
             about_com = _rotated_tensor(body, kinematics.joint_rotations[j])
             angular, linear = velocity[j][:3], velocity[j][3:] + ca.cross(velocity[j][:3], com)
             impulse = body.mass * linear
-            heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+            heavy = body.mass * body.gravity_fraction
             potential_energy -= heavy * ca.dot(gravity, com)
             second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
             momentum = ca.vertcat(about_com @ angular + ca.cross(com, impulse), impulse)

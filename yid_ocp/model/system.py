@@ -433,7 +433,7 @@ class System(ReprMixin):
         for j, joint in enumerate(tree.joints):
             for body in joint.bodies if index in tree.ancestor_joint_indices(j) else ():
                 com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
-                heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+                heavy = body.mass * body.gravity_fraction
                 force += heavy * ca.dot(ca.vertcat(ca.cross(com, self.gravity), self.gravity), screw)
         if self.n_constraints:
             force -= ca.dot(ca.jacobian(self.constraint_residual(kinematics), state.q[index]), state.constraint_force)

@@ -104,7 +104,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
         "damping": (*(spring.damping for spring in system.elastic_joints), *system.joint_damping.values()),
         "geometry": (part for placement in placements for part in (placement.rotation, placement.translation)),
         "inertia": (part for body in bodies for part in (body.mass, body.center_of_mass, body.inertia_about_com)),
-        "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
+        "weight": (body.gravity_fraction for body in bodies),
         "gravity": (system.gravity,),
         "grasp": (part for grasp in held for part in (grasp.held_orientation, grasp.holder_offset, grasp.axial_slip)),
         "grasp_compliance": (part for grasp in held for part in (grasp.compliance, grasp.relaxation_time)),
@@ -345,14 +345,14 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     """The tree with bodies of full weight, and the gravity fraction of bodies with another weight, by joint."""
     weights: dict[str, float] = {}
     for joint in tree.joints:
-        shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
+        shares = {float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
             said = ", ".join(f"{share:.4g}" for share in sorted(shares))
             what, where = f"bodies of one joint have {said} times the weight of their mass", f"joint '{joint.name}'"
             hint = "leave out one of the effects that change weights (model.effects)"
             raise ModelError(what, where=where, allowed="one factor for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
-    return tree.with_gravity_fraction(None), weights
+    return tree.with_gravity_fraction(ca.SX(1)), weights
 
 
 def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]:
