@@ -44,7 +44,7 @@ def system(driven=("s0", "s1", "w0"), prescribed=()):
         elastic_joints=tuple(SimpleNamespace(segment_name=name, deformation=way) for name, way in springs),
         grasps=(),
         effects=(),
-        mechanism=SimpleNamespace(joints=(SimpleNamespace(effort_limit=20.0),), joint_index=lambda name: 0),
+        mechanism=SimpleNamespace(joint=lambda name: SimpleNamespace(effort_limit=20.0)),
     )
 
 

@@ -15,6 +15,7 @@ from yid_ocp.inference.smoother import (
     smoothed_unknown_z_scores,
 )
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
+from yid_ocp.model.mechanism import Joint, Mechanism, Placement
 
 TWIST = SmoothedUnknownGroup("T1", "bias")
 NONE = {FORCE: 0.0, OTHER_FORCE: 0.0}
@@ -121,8 +122,9 @@ def test_only_informed_values_are_on_the_map(variance, std, mean, expected):
 
 
 def test_units_of_unknowns_are_those_of_their_joints_or_metres():
-    joints = (SimpleNamespace(name="slide", kind="prismatic"), SimpleNamespace(name="hinge", kind="revolute"))
-    system = SimpleNamespace(mechanism=SimpleNamespace(joints=joints, joint_names=("slide", "hinge")))
+    kinds = {"slide": "prismatic", "hinge": "revolute"}
+    joints = (Joint(name, kind, -1, Placement.identity(), (0.0, 0.0, 1.0)) for name, kind in kinds.items())
+    system = SimpleNamespace(mechanism=Mechanism("made", tuple(joints), {}))
     made = SimpleNamespace(
         unknown_names=("hinge", "slide", "left.x", "tip.z"), unknown_groups=(FORCE, FORCE, OFFSET, BIAS)
     )

@@ -117,7 +117,7 @@ def test_places_of_a_branched_cable(cable) -> None:
     changed = cable.with_effects([make_effect(kind, place, cable) for kind, place in found])
     assert changed.n_coordinates == cable.n_coordinates + 4
     assert changed.prescribed == cable.prescribed
-    branch = changed.mechanism.joints[changed.mechanism.joint_index("a_0_x")]
+    branch = changed.mechanism.joint("a_0_x")
     assert changed.mechanism.joints[branch.parent_index].name == "junction_compliance@junction_a_y"
 
 

@@ -22,7 +22,6 @@ from yid_ocp.inference.null_test import (
     residual_chi2_null_test,
     residuals_exceed_noise,
     whiten_with_drawn_errors,
-    whiten_with_extra_errors,
 )
 from yid_ocp.inference.uncertainty import (
     GoodnessOfFit,
@@ -39,6 +38,7 @@ from yid_ocp.inference.uncertainty import (
     unknowns_covariance_and_reduced_chi2,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.measurements import whiten_with_extra_errors
 from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 

@@ -134,7 +134,7 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     internal = {name: ca.SX.sym(name)}
 
     def change(effect, system):
-        placement = system.mechanism.joints[system.mechanism.joint_index(joint)].placement
+        placement = system.mechanism.joint(joint).placement
         shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal_coordinate_symbols[name], 0, 0))
         return changed_joint(system, joint, placement=placement @ shift)
 
@@ -151,7 +151,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     parameters = _parameters("air", joint, coefficient=coefficient, viscosity=viscosity, buoyancy=buoyancy)
 
     def change(effect, system):
-        bodies = system.mechanism.joints[system.mechanism.joint_index(joint)].bodies
+        bodies = system.mechanism.joint(joint).bodies
         lighter = tuple(replace(body, gravity_fraction=1 - effect.parameters.symbols[2]) for body in bodies)
         return changed_joint(system, joint, bodies=lighter)
 

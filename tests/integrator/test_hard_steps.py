@@ -153,4 +153,4 @@ def test_both_kernels_agree(parts, hard):
 @pytest.mark.parametrize("step", [3, 700])
 def test_a_failure_after_hundreds_of_steps_names_the_methods_limit(code, step):
     late = step == 700 and code in (NewtonStatusCode.NOT_CONVERGED, NewtonStatusCode.NOT_FINITE)
-    assert ("midpoint rule has no numerical damping" in RolloutNewtonSummary(code, step, 0.1, 5, 5).message) is late
+    assert ("midpoint rule has no numerical damping" in RolloutNewtonSummary(code, step, 0.1, 5).message) is late

@@ -72,7 +72,7 @@ def test_kept_joints_in_the_order_given(urdf_folder):
 
 def test_limits_and_kinds(urdf_folder):
     robot = read_urdf(urdf_folder / "mixed_joints.urdf")
-    slide, spin = (robot.joints[robot.joint_index(name)] for name in ("slide", "spin"))
+    slide, spin = map(robot.joint, ("slide", "spin"))
     assert (slide.kind, slide.unit("rad"), slide.lower_limit, slide.upper_limit) == ("prismatic", "m", -0.4, 0.6)
     assert (slide.effort_limit, slide.velocity_limit, slide.unit("N m s/rad")) == (120.0, 0.8, "N s/m")
     assert (spin.kind, spin.unit("rad")) == ("revolute", "rad")

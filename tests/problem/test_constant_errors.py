@@ -13,7 +13,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import (
     measurements_minus_sensor_error_estimates,
-    whiten_against_sensor_biases,
+    whiten_with_extra_errors,
     whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import SensorOptions
@@ -53,7 +53,7 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = whiten_against_sensor_biases(slopes, columns)
+    made = whiten_with_extra_errors(columns, slopes)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
 
 

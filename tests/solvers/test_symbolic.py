@@ -291,7 +291,7 @@ def chain(use_compiler=False, threshold=math.inf, ridge=None):
         "chain[one]": _VectorBlock(states, ("x or y",)),
     }
     blocks = variables, {"s": _VectorBlock(np.array([[COUNT]]), ("s",))}
-    terms = (stages,), (ResidualTerm(seen, between, weight, target, threshold), ResidualTerm(beside))
+    terms = (stages,), (ResidualTerm(seen, between, weight, target, threshold), ResidualTerm(beside, ca.DM.eye(2)))
     numbers = np.full(SIZE, -np.inf), np.full(SIZE, np.inf), 0.3 * rng.standard_normal(SIZE), values
     return NonlinearProgram(*blocks, *terms, *numbers, ridge, ca.MX.sym("w", SIZE), ca.MX.sym("p", len(values)))
 

@@ -317,7 +317,7 @@ def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
         posture = grasping_joint_angles(system)
         assert len(posture) == 7 * arms
         for name, angle in posture.items():
-            joint = system.mechanism.joints[system.mechanism.joint_index(name)]
+            joint = system.mechanism.joint(name)
             assert joint.lower_limit <= angle <= joint.upper_limit
         full = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
         assert np.abs(np.array(grasp_gaps(system)(full))).max() < 1e-8

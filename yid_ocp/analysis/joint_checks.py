@@ -67,8 +67,7 @@ class RecordedJointsModel:
     @property
     def joints(self) -> tuple[Joint, ...]:
         """The joints of the model, in the order of `joint_names`."""
-        mechanism = self.system.mechanism
-        return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
+        return tuple(map(self.system.mechanism.joint, self.joint_names))
 
     @property
     def system_configuration_indices(self) -> tuple[int, ...]:

@@ -136,7 +136,7 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
         index = model.addJoint(placed[joint.parent_index], kind(*joint.axis), placement, joint.name)
         placed[j] = index
         for body in joint.bodies:
-            fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
+            fraction = float(body.gravity_fraction) if weight else 1.0
             # gravity forces do not depend on the inertia about the centre of mass
             place, tensor = _number(body.center_of_mass).ravel(), _number(body.inertia_about_com)
             model.appendBodyToJoint(index, pin.Inertia(float(body.mass) * fraction, place, tensor), pin.SE3.Identity())

@@ -13,7 +13,7 @@ import casadi as ca
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_question
-from yid_ocp.integrator.codegen import COMPARISON_OPERATOR_SYMBOLS
+from yid_ocp.integrator.codegen import COMPARISON_OPERATOR_SYMBOLS, resolved_instructions
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 # Binding strength of an expression: an operand that binds less than required gets parentheses.
@@ -62,56 +62,36 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 
 def format_expressions(expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[str]) -> _FormulaText:
     """Convert scalar symbolic expressions to text. They contain no symbols but `variables` (k, 1), named by `names`."""
-    nodes, results = _nodes(_function(expressions, variables), len(expressions))
-    uses = Counter(itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results))
-    written, shared = list[tuple[str, int]](), list[tuple[str, str]]()
-    for i, (op, parts, value) in enumerate(nodes):
-        if op == ca.OP_INPUT:
-            written.append((names[int(value)], _ATOM))
+    instructions, results = resolved_instructions(_function(expressions, variables)), [0] * len(expressions)
+    uses = Counter(itertools.chain(*(own.inputs for own in instructions if own.code not in _LEAF_OPERATIONS)))
+    written, shared = dict[int, tuple[str, int]](), list[tuple[str, str]]()
+    for i, own in enumerate(instructions):
+        op, parts, value = own.code, own.inputs, own.constant
+        if op == ca.OP_OUTPUT:
+            results[own.outputs[1]] = parts[0]
+        elif op == ca.OP_INPUT:
+            written[i] = names[parts[1]], _ATOM
         elif op == ca.OP_CONST:
-            written.append((f"{value:.12g}", _SUM if value < 0 else _ATOM))
+            written[i] = f"{value:.12g}", _SUM if value < 0 else _ATOM
         else:
             # a function without a template binds like an atom, and its operands stand between commas
             template, tightness, asked = _TEXT_TEMPLATES.get(op, ("", _ATOM, (_COMPARISON,) * len(parts)))
             pairs = zip((written[part] for part in parts), asked, strict=True)
             texts = [text if has >= wants else f"({text})" for (text, has), wants in pairs]
             text = template.format(*texts) if template else f"{_FUNCTION_NAMES[op]}({', '.join(texts)})"
-            simple = op == ca.OP_NEG and nodes[parts[0]][0] in _LEAF_OPERATIONS
+            simple = op == ca.OP_NEG and instructions[parts[0]].code in _LEAF_OPERATIONS
             if uses[i] > 1 and not simple:
                 name_of = f"c{len(shared) + 1}"
                 shared.append((name_of, text))
                 text, tightness = name_of, _ATOM
-            written.append((text, tightness))
-    counted = sum(op not in _LEAF_OPERATIONS for op, _, _ in nodes)
-    seen = tuple(sorted({int(value) for op, _, value in nodes if op == ca.OP_INPUT}))
+            written[i] = text, tightness
+    counted = sum(own.code not in (*_LEAF_OPERATIONS, ca.OP_OUTPUT) for own in instructions)
+    seen = tuple(sorted({own.inputs[1] for own in instructions if own.code == ca.OP_INPUT}))
     return _FormulaText(tuple(shared), tuple(written[r][0] for r in results), counted, seen)
 
 
 def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
     return ca.Function("formula", [variables], [ca.cse(ca.densify(ca.vertcat(*expressions)))])
-
-
-_Node = tuple[int, tuple[int, ...], float]  # operation, nodes that it takes, index of a variable or a constant
-
-
-def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
-    """Return the function's instructions as nodes, each result in a node of its own, and the indices of the outputs."""
-    nodes, at = list[_Node](), dict[int, int]()
-    results = [0] * count
-    for i in range(function.n_instructions()):
-        op, taken, given = function.instruction_id(i), function.instruction_input(i), function.instruction_output(i)
-        if op == ca.OP_OUTPUT:
-            results[given[1]] = at[taken[0]]
-            continue
-        value = 0.0
-        if op == ca.OP_INPUT:
-            value = float(taken[1])
-        elif op == ca.OP_CONST:
-            value = function.instruction_constant(i)
-        parts = () if op in _LEAF_OPERATIONS else tuple(at[register] for register in taken)
-        at[given[0]] = len(nodes)
-        nodes.append((op, parts, float(value)))
-    return nodes, results
 
 
 _MAX_PRINTED_OPERATIONS = 80  # longer equations are printed only on request

@@ -38,7 +38,6 @@ from yid_ocp.inference.smoother import (
     SIGNIFICANT_Z,
     SmoothedUnknownsResult,
     force_log_likelihood_coefficients,
-    generalised_force_unit,
     smooth_unknown_forces_and_biases,
     smoothed_unknown_significance_mask,
 )
@@ -287,7 +286,7 @@ def _read_forces(
         for column, joint in enumerate(samples.sensor.effort_joints):
             at, square = problem.system.mechanism.joint_index(joint), weight[:, column] ** 2
             score, information = together @ (square * value[:, column]), np.diag(together @ square)
-            what = (episode.name, joint, joint, generalised_force_unit(problem.system, joint))
+            what = (episode.name, joint, joint, problem.system.mechanism.joint(joint).unit("N m"))
             allowed = (mean @ error[:, at], mean @ held[:, at], problem.options.path_cutoff)
             yield from _spans(ForceEstimate(*what, mean @ times, score, information, *allowed), limits)
 
@@ -310,7 +309,7 @@ def _driving_forces(
 ) -> list[ForceEstimate]:
     """Return force estimates at coordinates where the smoother found forces, but only for a small part of the time."""
     sought = {trace.recording: _short(smoothed, i) for i, trace in enumerate(smoothed.smoothed_unknowns)}
-    found: list[ForceEstimate] = []
+    found, mechanism = list[ForceEstimate](), problem.system.mechanism
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
@@ -328,7 +327,7 @@ def _driving_forces(
                 known = force_log_likelihood_coefficients(model, smoothed.group_variance | {source: 0.0}, chosen)
                 for index, (score, information) in zip(chosen if known else (), known, strict=True):
                     name, size = model.unknown_names[index], model.reference_std[index]
-                    at, unit = problem.system.mechanism.joint_index(name), generalised_force_unit(problem.system, name)
+                    at, unit = mechanism.joint_index(name), mechanism.joint(name).unit("N m")
                     what = (model.recording, source.location, name, unit, middle[full])
                     told = (score[full] / size, information[full, full] / size**2)
                     found.append(ForceEstimate(*what, *told, error[full, at], held[full, at]))

@@ -343,7 +343,7 @@ class _ServoSaturation(_ServoChange):
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of limit^-16. Reports show `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit of the joint."""
-        joint = system.mechanism.joints[system.mechanism.joint_index(location)]
+        joint = system.mechanism.joint(location)
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         return (_limit_definition(_MIN_LIMIT_FRACTION * known, joint.unit("N m"), "largest torque of the servo"),)
 

@@ -272,7 +272,7 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
 
 def effort_limit_ratio_to_baxter(system: System, joint: str) -> float:
     """Return a joint's effort limit divided by that of Baxter's joints, at least 1. It is 1 for unlimited joints."""
-    limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
+    limit = system.mechanism.joint(joint).effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameterValue
-from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
+from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product
 from yid_ocp.model.mechanism import Inertia, merge_inertias, symbolic_rotation_from_rpy
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.model.system import EffectStepTerms, ForceWithFactoredDerivatives, MidpointStateSymbols, System
@@ -36,7 +36,7 @@ class _CarriedBody(NamedTuple):
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:
     """Nominal mass properties of the bodies on a joint's moving side, in its frame. Without bodies the mass is zero."""
-    whole = merge_inertias([replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies])
+    whole = merge_inertias([replace(body, gravity_fraction=ca.SX(1)) for body in system.mechanism.joints[joint].bodies])
     if whole is None:
         return _CarriedBody(0.0, np.zeros(3), np.zeros((3, 3)))
     parameters = system.parameters
@@ -67,7 +67,7 @@ class _Density(_ScaledBodies):
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
     tree = system.mechanism
-    return tuple(name for name in base.arm_joint_names(system) if tree.joints[tree.joint_index(name)].bodies)
+    return tuple(name for name in base.arm_joint_names(system) if tree.joint(name).bodies)
 
 
 @EFFECTS.register("link_mass")
@@ -279,7 +279,7 @@ class _AerodynamicDrag(EffectBase):
     def step_terms(self, state: MidpointStateSymbols) -> EffectStepTerms:
         system, kinematics = state.system, state.kinematics
         tree, segment = system.mechanism, system.find_segment_layout(self.location)
-        velocity = _velocities(kinematics, state.v)
+        velocity, screw_rates = kinematics.joint_velocities_and_screw_rates(state.v)
         wrenches, slopes = {}, {}
         for link, length in zip(segment.link_joints, segment.link_lengths, strict=True):
             j = tree.joint_index(link[-1])
@@ -294,7 +294,7 @@ class _AerodynamicDrag(EffectBase):
             wrenches[j] = ca.vertcat(ca.cross(centre, push), push)
             reach = ca.horzcat(-ca.skew(centre), ca.SX.eye(3))
             slopes[j] = reach.T @ slope @ reach
-        return EffectStepTerms(force_with_derivatives=_on_bodies(kinematics, velocity, wrenches, slopes))
+        return EffectStepTerms(force_with_derivatives=_on_bodies(kinematics, screw_rates, wrenches, slopes))
 
 
 @EFFECTS.register("gravity_scale")
@@ -308,12 +308,10 @@ class _GravityScale(EffectBase):
 
     def apply_to_system(self, system: System) -> System:
 
-        def scaled(body: Inertia) -> Inertia:
-            nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
-            return replace(body, gravity_fraction=nominal + self["fraction"])
+        def scaled(bodies: tuple[Inertia, ...]) -> Iterator[Inertia]:
+            return (replace(body, gravity_fraction=body.gravity_fraction + self["fraction"]) for body in bodies)
 
-        joints = base.object_joint_names(system)
-        return base.system_with_changed_bodies(system, joints, lambda bodies: map(scaled, bodies))
+        return base.system_with_changed_bodies(system, base.object_joint_names(system), scaled)
 
 
 @EFFECTS.register("gravity_tilt")
@@ -331,17 +329,8 @@ class _GravityTilt(EffectBase):
         return replace(system, gravity=symbolic_rotation_from_rpy(self["rx"], self["ry"]) @ system.gravity)
 
 
-def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:
-    """Spatial velocity of each joint's moving side, shape (6, 1) each."""
-    result: list[ca.SX] = []
-    for j, joint in enumerate(kinematics.mechanism.joints):
-        own = kinematics.joint_screws[j] * v[j]
-        result.append(own if joint.parent_index < 0 else result[joint.parent_index] + own)
-    return result
-
-
 def _on_bodies(
-    kinematics: Kinematics, velocity: list[ca.SX], wrenches: dict[int, ca.SX], slopes: dict[int, ca.SX]
+    kinematics: Kinematics, screw_rates: list[ca.SX], wrenches: dict[int, ca.SX], slopes: dict[int, ca.SX]
 ) -> ForceWithFactoredDerivatives:
     """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
@@ -364,6 +353,5 @@ def _on_bodies(
                 sums[parent] = sums[parent] + sums[j] if parent in sums else sums[j]
         force[j] = ca.dot(screws[j], wrenches[j])
         along[j] = slopes[j] @ screws[j]
-        added = motion_cross_motion_product(velocity[parent], screws[j]) if parent >= 0 else zero
-        turned[j] = slopes[j] @ added + motion_cross_force_product(screws[j], wrenches[j])
+        turned[j] = slopes[j] @ screw_rates[j] + motion_cross_force_product(screws[j], wrenches[j])
     return ForceWithFactoredDerivatives(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))

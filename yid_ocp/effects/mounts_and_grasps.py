@@ -144,8 +144,7 @@ class _GraspCompliance(_GraspChange):
     )
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
-        own = self["compliance"] * self["damping"]
-        relaxation = own if grasp.relaxation_time is None else grasp.relaxation_time + own
+        relaxation = grasp.relaxation_time + self["compliance"] * self["damping"]
         return {"compliance": grasp.compliance + self["compliance"], "relaxation_time": relaxation}
 
 

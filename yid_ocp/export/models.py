@@ -67,7 +67,7 @@ def _xml_text(root: Element) -> str:
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, mjcf.JointDynamicsTerms]]:
     """Return the mechanism with numbers and without separate weights of bodies, and the dynamics of its joints."""
-    tree = system.mechanism_with_values(values).with_gravity_fraction(None)
+    tree = system.mechanism_with_values(values).with_gravity_fraction(ca.SX(1))
     return tree, mjcf.system_joint_dynamics_terms(system, mjcf.CasadiEvaluator(system, values))
 
 

@@ -21,7 +21,7 @@ from yid_ocp.inference import whitening
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
-from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.problem.measurements import SensorMeasurements, whiten_with_extra_errors
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.predictions import held_out_rmse_and_unit_by_channel
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
@@ -131,15 +131,6 @@ def residual_chi2_null_test(
 def excess_over_sample_count(residual: Array) -> float:
     """Return r'r of a whitened residual (n,) minus the number of used samples, which noise alone gives."""
     return float(residual @ residual) - np.count_nonzero(residual)
-
-
-def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Return (I + F F')^(-1/2) r, which whitens the residual r of covariance I for k further, independent errors.
-
-    r (nr,) or (nr, m) is `residual`. F (nr, k) is `spread`; column j, if finite, is the change by one std of error j.
-    """
-    columns, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
-    return np.asarray(residual + (columns * (1 / np.hypot(1.0, sizes) - 1)) @ (columns.T @ residual))
 
 
 def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Array:

@@ -588,10 +588,5 @@ def smoothed_unknown_units(system: System, trace: SmoothedDisturbances) -> tuple
     """Return the SI unit of each smoothed unknown in `trace`: a force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
-    return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
-
-
-def generalised_force_unit(system: System, coordinate: str) -> str:
-    """Return the SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
-    kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
-    return "N" if kinds.get(coordinate) == "prismatic" else "N m"
+    joint = system.mechanism.joint
+    return tuple(joint(name).unit("N m") if of.kind == "force" else other[of.kind] for name, of in pairs)

@@ -176,7 +176,7 @@ def _loads(course: _LinearizedEpisode) -> Array:
 def _segment_weights(system: System, theta: Array) -> dict[str, float]:
     tree, masses = system.mechanism, {}
     for segment in system.segment_layouts:
-        joints = [tree.joints[tree.joint_index(name)] for link in segment.link_joints for name in link]
+        joints = [tree.joint(name) for link in segment.link_joints for name in link]
         if tree.has_frame(f"{segment.name}:{_FORCE_POINT}"):
             masses[segment.name] = sum((body.mass for joint in joints for body in joint.bodies), ca.SX(0))
     if not masses:

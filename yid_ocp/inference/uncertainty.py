@@ -13,7 +13,7 @@ import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.channel_checks import Issue
-from yid_ocp.display import ReprMixin, ReprTexts
+from yid_ocp.display import ReprMixin, ReprTexts, grouped
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors, triangular_factor
@@ -246,14 +246,12 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     """Rows of the data in time blocks and, if there are enough, in recordings and in channels of recordings."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH))
-    blocks, recordings = dict[tuple[str, int], list[IntArray]](), dict[str, list[IntArray]]()
-    channels: list[list[IntArray]] = []
-    for series in null_test.channels_with_residual_indices(problem):
-        channels.append([series.residual_indices])
-        recordings.setdefault(series.recording, []).append(series.residual_indices)
-        at = (series.t / length).astype(int)
-        for block in np.unique(at):
-            blocks.setdefault((series.recording, int(block)), []).append(series.residual_indices[at == block])
+    series = null_test.channels_with_residual_indices(problem)
+    channels = [[own.residual_indices] for own in series]
+    recordings = grouped((own.recording, own.residual_indices) for own in series)
+    numbered = ((own, (own.t / length).astype(int)) for own in series)
+    parts = ((own.recording, own.residual_indices[at == k], int(k)) for own, at in numbered for k in np.unique(at))
+    blocks = grouped(((recording, k), rows) for recording, rows, k in parts)
     kinds = (
         (blocks.values(), len(blocks) > 1),
         (channels, len(recordings) > 1 and len(channels) >= _MIN_CLUSTER_CHANNELS),

@@ -306,13 +306,9 @@ def rows_and_columns_of_nonzeros(sparsity: ca.Sparsity) -> tuple[IntArray, IntAr
 
 def _runs(entries: _Indices) -> list[int]:
     """First number and last number + 1 of every run of consecutive numbers, in one list."""
-    result: list[int] = []
-    for value in map(int, entries):
-        if result and value == result[-1]:
-            result[-1] = value + 1
-        else:
-            result += [value, value + 1]
-    return result
+    values = np.array(entries, int)
+    runs = np.split(values, np.flatnonzero(np.diff(values) != 1) + 1)
+    return [bound for run in runs if len(run) for bound in (int(run[0]), int(run[-1]) + 1)]
 
 
 # libm's functions of one member after another
@@ -361,7 +357,9 @@ def _simd_c_source(functions: Sequence[ca.Function]) -> str | None:
 
 
 @dataclass(frozen=True)
-class _Instruction:
+class ResolvedInstruction:
+    """One instruction of a CasADi function."""
+
     code: int
     inputs: list[int]  # argument and entry, or the instructions whose values it takes
     outputs: list[int]  # the place of CasADi's work vector, or result and entry
@@ -369,7 +367,7 @@ class _Instruction:
 
 
 def _source(function: ca.Function) -> str | None:
-    instructions = _instructions(function)
+    instructions = resolved_instructions(function)
     if any(instruction.code not in _TRANSLATED_OPERATIONS for instruction in instructions):
         return None
     size = _PART_INSTRUCTION_COUNT if _is_long_function(function) else max(len(instructions), 1)
@@ -387,23 +385,23 @@ def _source(function: ca.Function) -> str | None:
     return "\n".join([*written, f"static void {name}({signature}) {{", *calls, "}"])
 
 
-def _instructions(function: ca.Function) -> list[_Instruction]:
-    """Instructions of a function, in order. Inputs of an operation without a SIMD form are not resolved."""
+def resolved_instructions(function: ca.Function) -> list[ResolvedInstruction]:
+    """Return the instructions of a function of SX expressions, in order, each with the instructions that it uses."""
     held: dict[int, int] = {}  # the instruction whose value stands in a place now
     found = []
     for k in range(function.n_instructions()):
         code, inputs = function.instruction_id(k), function.instruction_input(k)
         outputs = function.instruction_output(k)
-        if code in _TRANSLATED_OPERATIONS and code != ca.OP_INPUT:
+        if code not in (ca.OP_INPUT, ca.OP_PARAMETER):
             inputs = [held[place] for place in inputs]
         constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
-        found.append(_Instruction(code, inputs, outputs, constant))
+        found.append(ResolvedInstruction(code, inputs, outputs, constant))
         if code != ca.OP_OUTPUT:
             held.update(dict.fromkeys(outputs, k))
     return found
 
 
-def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
+def _part(instructions: Sequence[ResolvedInstruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
     """C lines of some instructions. Values that later parts need are written to the work vector."""
     lines: list[str] = []
     known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Hashable, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.display import grouped
 from yid_ocp.errors import ModelError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
@@ -70,7 +72,7 @@ _Linearization = _struct(
     "Linearization", "pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta"
 )
 _StepMaps = _struct("StepMaps", "int inputs loads", "pointer torque on_rows on_p1 after effort")
-_Outcome = _struct("Outcome", "int step status", "double error", "long iterations factorisations memory")
+_Outcome = _struct("Outcome", "int step status", "double error", "long iterations memory")
 
 
 def _filled(kind: type[_Struct], *values: object) -> _Struct:
@@ -130,18 +132,15 @@ class CompiledKernel:
         return call_merged_with_other_threads(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        alike: dict[Hashable, list[int]] = {}
-        for i, member in enumerate(members):
-            loop = None if member.feedback is None else tuple(np.asarray(member.feedback.state_indices).tolist())
-            alike.setdefault((loop, member.directions is None), []).append(i)
+        loops = (m.feedback and tuple(np.asarray(m.feedback.state_indices).tolist()) for m in members)
+        kinds = zip(loops, (m.directions is None for m in members), strict=True)
+        alike = grouped((kind, i) for i, kind in enumerate(kinds))
         # a batch costs as many columns and steps as its widest and longest member
         for group in alike.values():
             group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
         batches = [part for group in alike.values() for part in self._split(group, members)]
         made = map_in_threads(lambda batch: self._together([members[i] for i in batch]), batches)
-        found: dict[int, Rollout] = {}
-        for batch, rollouts in zip(batches, made, strict=True):
-            found |= zip(batch, rollouts, strict=True)
+        found = dict(zip(itertools.chain(*batches), itertools.chain(*made), strict=True))
         return [found[i] for i in range(len(members))]
 
     def _split(self, group: Sequence[int], members: Sequence[RolloutInputs]) -> list[Sequence[int]]:
@@ -186,7 +185,7 @@ class CompiledKernel:
         filled = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
-        ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
+        ends = ((o.status, o.step, o.error, o.iterations) for o in outcomes)
         return [attach_status_to_rollout(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(

@@ -31,9 +31,8 @@ from yid_ocp.model.kinematics import (
     lagrangian_first_derivatives,
     lagrangian_second_derivatives,
 )
-from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
-from yid_ocp.model.system import ForceWithFactoredDerivatives, Grasp, MidpointStateSymbols, System
+from yid_ocp.model.system import ForceWithFactoredDerivatives, MidpointStateSymbols, System
 
 RIGID_HOLD_STIFFNESS = 1e5
 """Stiffness of a spring that holds a joint at its measured angle with less deflection than encoder noise [N m/rad]."""
@@ -130,8 +129,6 @@ class DiscreteEquations:
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
         """The constraint violation phi(q_{k+1}) - C lam / h (m, 1) at the end of the step, without relaxation."""
-        if self.constraint_relaxation_gain is None:
-            return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
@@ -284,11 +281,11 @@ def _constraint(system: System, at: _Symbols, middle: Kinematics) -> tuple[ca.SX
         return ca.substitute([residual], [at.qm, at.internal], [q, z])[0]
 
     closure, gain = phi(at.q1, at.z1), None
-    relaxation = system.constraint_relaxation_times()
-    if relaxation is not None:
-        gain = 1 + relaxation / at.h
+    grasp_of_row = [grasp for grasp in system.grasps for _ in range(grasp.n_constraint_equations)]
+    if not all(grasp.relaxation_time.is_zero() for grasp in grasp_of_row):
+        gain = 1 + ca.vertcat(*(grasp.relaxation_time for grasp in grasp_of_row)) / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    compliances = (grasp.compliance for grasp in system.grasps for _ in range(grasp.n_constraint_equations))
+    compliances = (grasp.compliance for grasp in grasp_of_row)
     return ca.densify(closure - ca.vertcat(ca.SX(0, 1), *compliances) * at.lam / at.h), gain
 
 
@@ -316,7 +313,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
     for grasp in system.grasps:
         part = lam[row : row + grasp.n_constraint_equations]
         row += grasp.n_constraint_equations
-        frames = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
+        frames = grasp.grasped_point_frames(system.mechanism)
         axes = [kinematics.angular_jacobian(frame) for frame in frames]  # w_j, zero for a prismatic joint
         block = ca.SX(3, n)
         for sign, frame, own in zip((1.0, -1.0), frames, axes, strict=True):
@@ -324,7 +321,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
             block += sign * jacobian
             upper += sign * ca.triu((ca.skew(part[:3]) @ own).T @ jacobian)
         blocks.append(block)
-        rows = _direction_products(grasp, kinematics)
+        rows = grasp.orientation_products(kinematics)
         blocks += [sum((ca.cross(a, b).T @ (axes[0] - axes[1]) for a, b in pairs), ca.SX(1, n)) for pairs in rows]
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns = [-ca.skew(vector) @ own for vector, own in ((a, axes[0]), (b, axes[1]))]
@@ -332,27 +329,6 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, lam: ca.SX) 
             mixed = turns[0].T @ turns[1]
             upper += ca.triu(mixed + mixed.T)
     return [ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(ca.triu2symm(upper))]
-
-
-def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
-    """For each orientation row of a grasp, the pairs of vectors (holder, held frame) whose dot products sum to it."""
-    if grasp.kind == "point":
-        return []
-    a = ca.horzsplit(kinematics.frame_pose(grasp.holder_frame).rotation @ grasp.held_orientation)
-    b = ca.horzsplit(kinematics.frame_pose(grasp.held_frame).rotation)
-    if grasp.kind == "axis":
-        return [[(a[0], b[2])], [(a[1], b[2])]]
-    return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in ((2, 1), (0, 2), (1, 0))]
-
-
-def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
-    """The frame whose origin is the grasped point, on one side of a grasp."""
-    if side == "holder":
-        name, local = grasp.holder_frame, Placement(grasp.held_orientation, grasp.holder_offset)
-    else:
-        name, local = grasp.held_frame, Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
-    frame = system.mechanism.frame(name)
-    return Frame(frame.joint_index, frame.placement @ local)
 
 
 @dataclass(frozen=True)

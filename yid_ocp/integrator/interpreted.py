@@ -183,7 +183,7 @@ class InterpretedKernel:
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return attach_status_to_rollout(out, self._model.sizes, code, done, error, (total, total))
+        return attach_status_to_rollout(out, self._model.sizes, code, done, error, total)
 
     def _moved(
         self,

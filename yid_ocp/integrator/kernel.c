@@ -48,7 +48,7 @@ typedef struct {
     void *block;
     mask factored;
     int age; /* of the factors [steps] */
-    whole iterations, factorisations;
+    whole iterations;
 } Work;
 
 typedef struct {
@@ -275,7 +275,6 @@ static mask factorise(Work *k, mask wanted, mask at_work) {
     const mask good = eliminate(k, f) & wanted;
     if (apart) take_factors(&k->factors, f, wanted);
     k->factored = (k->factored & NOT(wanted)) | good;
-    k->factorisations += ONES(good);
     return good;
 }
 
@@ -604,11 +603,12 @@ typedef struct {
     double *after, *effort;
 } StepMaps;
 
-/* The step reached and how it ended, Newton's last correction, totals, and the memory that was asked for [bytes]. */
+/* The step reached and how it ended, Newton's last correction, their total, and the memory that was asked for [bytes]; all
+ * zero when it is handed over. */
 typedef struct {
     int step, status;
     double error;
-    long long iterations, factorisations, memory;
+    long long iterations, memory;
 } Outcome;
 
 /* C += nz in one member's entries. */
@@ -763,7 +763,6 @@ static void guess(real *const x[3], int step, const real *prescribed, real *q1, 
 static Work *work_new(size_t numbers, Outcome *outcome) {
     const size_t reals = numbers + ONE(SZ_W);
     const size_t size = sizeof(Work) + sizeof(real) * reals + sizeof(long long) * ONE(SZ_IW) + 2 * ALIGNMENT;
-    memset(outcome, 0, sizeof *outcome);
     outcome->memory = (long long)size;
     char *block = YID_ALLOCATE(1, size);
     if (!block) return NULL;
@@ -798,7 +797,6 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     for (int entry = 0; entry < members && motions->directions; entry++)
         if ((size_t)motions[entry].directions->count > d) d = motions[entry].directions->count;
     const size_t apart = SIMD_WIDTH == 1 ? 0 : d; /* a single member's columns are worked out where they are wanted */
-    memset(outcomes, 0, sizeof(Outcome) * members);
     Work *k = work_new(3 * NX + NTHETA + (NU + 1) * (size_t)feeds + NU + NC + d * (2 * NT + NY + NU + NQZ) +
                            apart * (2 * NX + M + 2 * NC) + BLOCK,
                        outcomes);
@@ -947,7 +945,6 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         if (outcomes[entry].status == OK) outcomes[entry].step = motions[entry].steps;
         outcomes[entry].error = SIMD_ENTRY(m.error, entry);
         outcomes[entry].iterations = SIMD_ENTRY(k->iterations, entry);
-        outcomes[entry].factorisations = SIMD_ENTRY(k->factorisations, entry);
     }
     YID_FREE(k->block);
     return OK;
@@ -975,19 +972,11 @@ static void solve_transposed(Work *k, const double *b, double *x) {
     for (int a = 0; a < NY; a++) x[order[a]] = y[a];
 }
 
-/* What a step ends with, copied because a step may write it; and the torque where there is none. */
-typedef struct {
-    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
-} Ends;
-
 /* One step of a trajectory that is given, and what pulls at its first node; with `whole` its rows and p1 as well. */
-static Point recorded_step(Work *k, const Motion *motion, const Trajectory *along, int step, Ends *ends, int whole) {
-    const double *x = along->state + (size_t)step * NX, *next = x + NX;
-    const double *u = NU ? along->applied + (size_t)step * NU : ends->none;
-    memcpy(ends->q1, next, sizeof(double) * N);
-    memcpy(ends->z1, next + 2 * N, sizeof(double) * NZ);
-    memcpy(ends->lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
-    const Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, ends->q1, ends->z1, ends->lam};
+static Point recorded_step(Work *k, const Motion *motion, const Trajectory *along, int step, int whole) {
+    double *x = along->state + (size_t)step * NX, *next = x + NX, *lam = along->multipliers + (size_t)step * M;
+    const double *u = along->applied + (size_t)step * NU;
+    const Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, next, next + 2 * N, lam};
     constraint_matrix(k, &a);
     if (whole) {
         evaluate(k, &a);
@@ -1006,12 +995,11 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
     if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
     double costate[ONE(NX)], g[ONE(NY)], nu[ONE(NY)], full[ONE(NT)], mu[ONE(NX)], mu_u[ONE(NU)];
-    Ends ends = {0};
     memset(gradient->theta, 0, sizeof(double) * thetas);
     memcpy(costate, by->state + (size_t)steps * NX, sizeof(double) * NX);
     int status = OK, step = steps - 1;
     for (; step >= 0; step--) {
-        const Point a = recorded_step(k, motion, rollout, step, &ends, MIDDLE);
+        const Point a = recorded_step(k, motion, rollout, step, MIDDLE);
         linearise(k, &a, 1);
         if (NY && !factorise(k, EVERY, EVERY)) {
             status = SINGULAR;
@@ -1082,9 +1070,8 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     Work *k = work_new(0, outcome);
     if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
-    Ends ends = {0};
     for (int step = 0; step < motion->steps; step++) {
-        const Point a = recorded_step(k, motion, along, step, &ends, 1);
+        const Point a = recorded_step(k, motion, along, step, 1);
         double *r = out->rows + (size_t)step * NT;
         memcpy(r, k->balance, sizeof(double) * N);
         memcpy(r + N, k->internal, sizeof(double) * NZ);
@@ -1135,10 +1122,9 @@ int yid_step_maps(const Motion *motion, const Trajectory *along, const StepMaps 
     if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
     double *Y = k->room, *joined = Y + (size_t)NY * d;
-    Ends ends = {0};
     int status = OK;
     for (int step = 0; step < motion->steps; step++) {
-        const Point a = recorded_step(k, motion, along, step, &ends, MIDDLE);
+        const Point a = recorded_step(k, motion, along, step, MIDDLE);
         linearise(k, &a, 1);
         if (NY && !factorise(k, EVERY, EVERY)) {
             status = SINGULAR;

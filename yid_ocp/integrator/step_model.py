@@ -90,7 +90,7 @@ _INSTABILITY_CAUSE = "usually because a fast vibration grows: the midpoint rule 
 
 @dataclass(frozen=True)
 class RolloutNewtonSummary:
-    """The outcome of a rollout: status code, last Newton correction [rad or m], and counts over all steps.
+    """The outcome of a rollout: status code, last Newton correction [rad or m], and Newton iterations of all steps.
 
     `prescribed_effort` (nc,) [N m] is that at the start of the last step, `internal_coordinates` (nz,) at its end.
     """
@@ -99,7 +99,6 @@ class RolloutNewtonSummary:
     completed_steps: int
     last_correction: float
     newton_iterations: int
-    factorisations: int
     prescribed_effort: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     internal_coordinates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
@@ -241,7 +240,7 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
         shapes |= {name: (*shapes[name.removesuffix("_sensitivity")], count) for name in names}
     arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, np.empty)
     values: dict[str, Any] = dict.fromkeys(names) | arrays
-    return Rollout(**values, status=RolloutNewtonSummary(NewtonStatusCode.OK, 0, 0.0, 0, 0))
+    return Rollout(**values, status=RolloutNewtonSummary(NewtonStatusCode.OK, 0, 0.0, 0))
 
 
 def allocate_step_linearizations(
@@ -273,13 +272,13 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 
 
 def attach_status_to_rollout(
-    rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
+    rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, iterations: int
 ) -> Rollout:
-    """Add a status to a rollout, and set values after a failed step to NaN. `counts` are iterations, factorisations."""
+    """Add a status to a rollout, and set values after a failed step to NaN."""
     if code != NewtonStatusCode.OK:
         first_missing = {"state": step + 2, "state_sensitivity": step + 1}  # the last state that was tried is kept
         for name in [name for name, array in vars(rollout).items() if isinstance(array, np.ndarray)]:
             getattr(rollout, name)[first_missing.get(name, step) :] = np.nan
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
-    return replace(rollout, status=RolloutNewtonSummary(NewtonStatusCode(code), step, error, *counts, last, inner))
+    return replace(rollout, status=RolloutNewtonSummary(NewtonStatusCode(code), step, error, iterations, last, inner))

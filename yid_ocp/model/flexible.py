@@ -139,10 +139,9 @@ def flexible_object(
     """
     root = Placement.identity() if root_placement is None else Placement.from_matrix(root_placement)
     parts = _Parts(frames={"object_root": Frame(-1, root)})
-    fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
     for segment in segments:
         _check(segment, parts.layouts)
-        _add_segment(parts, segment, root, fraction)
+        _add_segment(parts, segment, root, ca.SX(gravity_fraction))
     tree = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters), parts.chains)
     return FlexibleObject(tree, tuple(parts.elastic), tuple(parts.layouts.values()))
 
@@ -157,7 +156,7 @@ class _Parts:
     chains: dict[str, ArcLengthChain] = field(default_factory=dict)
 
 
-def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravity_fraction: ca.SX | None) -> None:
+def _add_segment(parts: _Parts, segment: FlexibleSegment, root: Placement, gravity_fraction: ca.SX) -> None:
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)

@@ -42,6 +42,15 @@ class Kinematics:
         """Return the Jacobian (3, n) of a frame's angular velocity, in world axes, with respect to the joint rates."""
         return self._columns(frame, lambda screw: screw[:3])
 
+    def joint_velocities_and_screw_rates(self, v: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
+        """Return each joint's spatial velocity V_j and the rate D_j = V_parent x S_j of its screw, each (6, 1)."""
+        velocities, rates = list[ca.SX](), list[ca.SX]()
+        for j, joint in enumerate(self.mechanism.joints):
+            above = velocities[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
+            rates.append(motion_cross_motion_product(above, self.joint_screws[j]))
+            velocities.append(above + self.joint_screws[j] * v[j])
+        return velocities, rates
+
     def _frame(self, frame: str | Frame) -> Frame:
         return self.mechanism.frame(frame) if isinstance(frame, str) else frame
 
@@ -110,12 +119,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 
 def lagrangian_first_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> LagrangianFirstDerivatives:
     """Compute the first derivatives of the bodies' Lagrangian at joint velocities v (n, 1) and gravity (3, 1)."""
-    joints, S = kinematics.mechanism.joints, kinematics.joint_screws
-    velocity, D = list[ca.SX](), list[ca.SX]()
-    for j, joint in enumerate(joints):
-        above = velocity[joint.parent_index] if joint.parent_index >= 0 else ca.SX(ca.DM.zeros(6))
-        D.append(motion_cross_motion_product(above, S[j]) if joint.parent_index >= 0 else above)
-        velocity.append(above + S[j] * v[j])
+    S, (velocity, D) = kinematics.joint_screws, kinematics.joint_velocities_and_screw_rates(v)
     moved, potential_energy = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
     for j, part in enumerate(moved):
@@ -159,14 +163,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     moved = [_Moved() for _ in joints]
     potential_energy = ca.SX(0)
     # if a body's weight is not mass times gravity, weights are summed separately from inertia
-    apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
+    apart = any(not body.gravity_fraction.is_one() for joint in joints for body in joint.bodies)
     for j, joint in enumerate(joints):
         for body in joint.bodies:
             com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
             about_com = _rotated_tensor(body, kinematics.joint_rotations[j])
             angular, linear = velocity[j][:3], velocity[j][3:] + ca.cross(velocity[j][:3], com)
             impulse = body.mass * linear
-            heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+            heavy = body.mass * body.gravity_fraction
             potential_energy -= heavy * ca.dot(gravity, com)
             second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
             momentum = ca.vertcat(about_com @ angular + ca.cross(com, impulse), impulse)

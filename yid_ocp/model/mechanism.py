@@ -51,13 +51,13 @@ class Placement:
 class Inertia:
     """The mass [kg], centre of mass [m] and inertia tensor about that centre [kg m^2] of a body, in its joint's frame.
 
-    `gravity_fraction` multiplies the weight of the body, not its inertia; None means 1.
+    `gravity_fraction` multiplies the weight of the body, not its inertia.
     """
 
     mass: ca.SX
     center_of_mass: ca.SX
     inertia_about_com: ca.SX
-    gravity_fraction: ca.SX | None = None
+    gravity_fraction: ca.SX = field(default_factory=lambda: ca.SX(1))
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
@@ -157,6 +157,10 @@ class Mechanism(ReprMixin):
         require_known_names([name], names, "joint", f"model '{self.name}'", ModelError)
         return names.index(name)
 
+    def joint(self, name: str) -> Joint:
+        """Return a joint by name. Raises `ModelError`, with the nearest name, if there is no such joint."""
+        return self.joints[self.joint_index(name)]
+
     def has_frame(self, name: str) -> bool:
         """Check whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
@@ -227,8 +231,8 @@ class Mechanism(ReprMixin):
         added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})
 
-    def with_gravity_fraction(self, fraction: ca.SX | None) -> Mechanism:
-        """Return a copy in which the weight of every body is multiplied by `fraction`; None means 1."""
+    def with_gravity_fraction(self, fraction: ca.SX) -> Mechanism:
+        """Return a copy in which the weight of every body is multiplied by `fraction`."""
         bodies = [tuple(replace(b, gravity_fraction=fraction) for b in joint.bodies) for joint in self.joints]
         joints = tuple(replace(joint, bodies=own) for joint, own in zip(self.joints, bodies, strict=True))
         return replace(self, joints=joints)
@@ -307,7 +311,7 @@ def merge_inertias(bodies: Iterable[Inertia]) -> Inertia | None:
     mass = sum((b.mass for b in entries), ca.SX(0))
     if mass.is_zero():
         return None
-    if not all(b.gravity_fraction is None or b.gravity_fraction.is_one() for b in entries):
+    if not all(body.gravity_fraction.is_one() for body in entries):
         what = "the weight of a body is not its mass times gravity, so the body cannot be merged or written to a file"
         hint = "leave out effects that change weights but not masses, and set model.object.gravity_fraction: 1"
         raise ModelError(what, where="effects of the model", allowed="bodies with weight = mass * gravity", hint=hint)

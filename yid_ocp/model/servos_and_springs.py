@@ -191,7 +191,7 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: StiffnessAndRest) -> tuple[Parameter, Parameter]:
     """Make the parameters `JOINT.stiffness` and `JOINT.rest` for the spring of a robot joint."""
-    unit, rest = tree.joints[tree.joint_index(joint)].unit, f"where the spring on {joint} is relaxed"
+    unit, rest = tree.joint(joint).unit, f"where the spring on {joint} is relaxed"
     return (
         Parameter(f"{joint}.stiffness", spring.stiffness, unit("N m/rad"), 0.0, math.inf, f"stiffness of {joint}"),
         Parameter(f"{joint}.rest", spring.rest_position, unit("rad"), description=rest),
@@ -208,7 +208,7 @@ def build_joint_servos(
     """
     servos, entries = {}, []
     for joint in joints:
-        at = tree.joints[tree.joint_index(joint)]
+        at = tree.joint(joint)
         own = _servo_parameters(at)
         gain, damping, delay, limit = (entry.symbol for entry in own)
         if options.motor.kind == "dc":

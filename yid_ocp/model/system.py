@@ -50,7 +50,7 @@ class Grasp:
     """Distance by which the grasped point has slipped along the object's z axis [m]."""
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
     """C in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h [m/N]; zero if rigid."""
-    relaxation_time: ca.SX | None = None
+    relaxation_time: ca.SX = field(default_factory=lambda: ca.SX(0))
     """T in the equation of `compliance` [s]."""
 
     @property
@@ -63,17 +63,27 @@ class Grasp:
         """The names of the constraint equations: positions such as `left.x`, then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
+    def grasped_point_frames(self, mechanism: Mechanism) -> tuple[Frame, Frame]:
+        """Return the frames of holder and held link whose origins coincide in the grasp, and whose axes it aligns."""
+        slipped = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -self.axial_slip))
+        holder, held = mechanism.frame(self.holder_frame), mechanism.frame(self.held_frame)
+        local = Placement(self.held_orientation, self.holder_offset)
+        return Frame(holder.joint_index, holder.placement @ local), Frame(held.joint_index, held.placement @ slipped)
+
+    def orientation_products(self, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
+        """Return for each orientation equation the pairs of vectors (of holder, held) whose dot products sum to it."""
+        frames = self.grasped_point_frames(kinematics.mechanism)
+        a, b = (ca.horzsplit(kinematics.frame_pose(frame).rotation) for frame in frames)
+        if self.kind == "axis":
+            return [[(a[0], b[2])], [(a[1], b[2])]]
+        turns = ((2, 1), (0, 2), (1, 0)) if self.kind == "weld" else ()
+        return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in turns]
+
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Return the constraint residual phi(q), holder minus held, a column: position [m], then orientation [rad]."""
-        holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
-        held = kinematics.frame_pose(self.held_frame)
-        rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
-        if self.kind == "axis":
-            rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
-        elif self.kind == "weld":
-            error = holder.rotation.T @ held.rotation
-            rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
-        return ca.vertcat(*rows)
+        holder, held = map(kinematics.frame_position, self.grasped_point_frames(kinematics.mechanism))
+        rows = (sum((ca.dot(a, b) for a, b in pairs), ca.SX(0)) for pairs in self.orientation_products(kinematics))
+        return ca.vertcat(holder - held, *rows)
 
     def holder_minus_held_axis_directions(self, kinematics: Kinematics) -> ca.SX:
         """Return the holder's axes minus the held axes (0, 3 or 9 rows), which is not zero for opposite axes."""
@@ -291,7 +301,7 @@ class System(ReprMixin):
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
         wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        damped = {name: tree.joints[tree.joint_index(name)] for name in wanted}  # unknown joints raise `ModelError`
+        damped = {name: tree.joint(name) for name in wanted}  # unknown joints raise `ModelError`
         dampers = {
             n: Parameter(f"{n}.damping", wanted[n], joint.unit("N m s/rad"), 0.0, math.inf, f"damping of {n}")
             for n, joint in damped.items()
@@ -423,7 +433,7 @@ class System(ReprMixin):
         for j, joint in enumerate(tree.joints):
             for body in joint.bodies if index in tree.ancestor_joint_indices(j) else ():
                 com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
-                heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+                heavy = body.mass * body.gravity_fraction
                 force += heavy * ca.dot(ca.vertcat(ca.cross(com, self.gravity), self.gravity), screw)
         if self.n_constraints:
             force -= ca.dot(ca.jacobian(self.constraint_residual(kinematics), state.q[index]), state.constraint_force)
@@ -437,13 +447,6 @@ class System(ReprMixin):
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Return the constraint residual phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *(grasp.constraint_residual(kinematics) for grasp in self.grasps))
-
-    def constraint_relaxation_times(self) -> ca.SX | None:
-        """Return the relaxation times T (m, 1) [s] in phi + T dphi/dt = C lam / h. None if no grasp has one."""
-        if all(grasp.relaxation_time is None for grasp in self.grasps):
-            return None
-        times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
-        return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
 
 def _check_names(

@@ -310,7 +310,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
     chosen = np.array([float(posture[name]) for name in system.prescribed])
     for name, value, low, high in zip(system.prescribed, chosen, *_position_limits(system), strict=True):
         if not low - 1e-9 <= value <= high + 1e-9:
-            unit = system.mechanism.joints[system.mechanism.joint_index(name)].unit("rad")
+            unit = system.mechanism.joint(name).unit("rad")
             over = max(low - value, value - high)
             what = f"joint {name} starts at {value:.4g} {unit}, which is {over:.3g} {unit} beyond its limit"
             allowed, hint = f"{low:.4g} to {high:.4g} {unit}", f"set {where}.{name} to a position within its limits"

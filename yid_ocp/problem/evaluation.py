@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import (
     ResidualAndJacobian,
     SensorMeasurements,
     huber_loss_and_sqrt_weights,
-    whiten_against_sensor_biases,
+    whiten_with_extra_errors,
     whitened_measurement_sensitivities_to_sensor_errors,
 )
 from yid_ocp.problem.options import ProblemOptions
@@ -122,7 +122,7 @@ def episode_residual_and_jacobian(
 ) -> ResidualAndJacobian:
     """Whiten one episode's residual by sensor noise, or by the Kalman filter `whitening` if given.
 
-    Constant sensor errors count as noise (`whiten_against_sensor_biases`). `threshold` is the Huber threshold.
+    Constant sensor errors count as noise (`whiten_with_extra_errors`). `threshold` is the Huber threshold.
     """
     by_constants = whitened_measurement_sensitivities_to_sensor_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
@@ -138,7 +138,7 @@ def episode_residual_and_jacobian(
         innovations, _ = whitening.whiten_residuals_and_estimate_torque_bias(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
-        columns = whiten_against_sensor_biases(by_constants, columns)
+        columns = whiten_with_extra_errors(columns, by_constants)
     cost, factor = huber_loss_and_sqrt_weights(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
@@ -237,21 +237,18 @@ def stated_prior_stds_of_unknowns(
     `inertia` returns the mass matrix diagonal of named joints, which converts a velocity std to a momentum std. An
     effect's internal coordinate has a uniform prior within its limits, and the std of this uniform prior is returned.
     """
-    limits, stds = _unobserved_state_limits(system), []
+    limits, at_start = _unobserved_state_limits(system), list[float]()
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     known = dict(zip(joint.parameter_names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
-    for name in unknowns.unknown_names:
-        base = name.split("[")[0]
-        if base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}q."):
-            stds.append(options.initial_configuration_prior_std)
-        elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."):
-            mass = float(inertia((base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}p."),))[0])
-            stds.append(options.initial_velocity_prior_std * max(mass, 1e-9))
-        elif base.startswith(f"{INITIAL_STATE_UNKNOWN_PREFIX}z."):
-            stds.append(limits[base.removeprefix(f"{INITIAL_STATE_UNKNOWN_PREFIX}z.")] / math.sqrt(3))
+    for part, _, name in (name.partition(".") for name in unknowns.initial_state_names):
+        if part == "q":
+            at_start.append(options.initial_configuration_prior_std)
+        elif part == "p":
+            at_start.append(options.initial_velocity_prior_std * max(float(inertia((name,))[0]), 1e-9))
         else:
-            stds.append(known.get(name, float(options.prior_stds.get(base, np.inf))))
-    return np.array(stds)
+            at_start.append(limits[name] / math.sqrt(3))
+    stated = {**options.prior_stds, **known}
+    return unknowns.pack_same_for_all_recordings(lambda name: stated.get(name, math.inf), np.array(at_start))
 
 
 def _stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:

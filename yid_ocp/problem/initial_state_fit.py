@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
+from yid_ocp.display import grouped
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import steady_effect_internal_coordinates
 from yid_ocp.integrator.step import Step, generalized_momentum_from_velocity
@@ -114,13 +115,12 @@ class InitialStateFitter:
         """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
-        frames: dict[int, list[tuple[SensorMeasurements, int]]] = {}
-        for group in samples:
-            if group.sensor.point_names:
-                for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
-                    near = int(node + round(float(fraction)))
-                    if near <= last and np.any(group.weight[row] > 0):
-                        frames.setdefault(near, []).append((group, row))
+        nearest = ((s, s.node + np.rint(s.fraction)) for s in samples if s.sensor.point_names)
+        frames = grouped(
+            (int(near[row]), (group, int(row)))
+            for group, near in nearest
+            for row in np.flatnonzero((near <= last) & group.positive_weight_mask.any(axis=1))
+        )
         if not frames:
             what = f"no point is seen in the first {window:g} s of a recording, so its initial state cannot be fitted"
             where, allowed = "problem.initial_state_fit_window", "a window in which a point is measured [s]"

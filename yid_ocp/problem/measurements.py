@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 from numpy.typing import ArrayLike
 
@@ -149,9 +150,9 @@ class SensorMeasurements:
 
     def whitened_residual(self, predicted: Array) -> Array:
         """Compute the whitened residual (M, k), prediction minus measurement. It is zero where nothing was measured."""
-        plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.residual_decorrelation_matrix is not None:
-            plain[self.positive_weight_mask] = self.residual_decorrelation_matrix @ plain[self.positive_weight_mask]
+        seen = self.positive_weight_mask
+        plain = np.asarray(self.weight * np.where(seen, predicted - self.value, 0.0))
+        plain[seen] = self.decorrelate_residual_rows(plain[seen])
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
@@ -217,14 +218,10 @@ class SensorMeasurements:
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
         between = self.fraction > 0
-        place = np.searchsorted(nodes, self.node)
-        if self.node.ndim == 1:
-            np.add.at(result, place, (1 - fraction) * at_samples)
-            np.add.at(result, np.searchsorted(nodes, self.node[between] + 1), (fraction * at_samples)[between])
-            return result
-        column = np.broadcast_to(np.arange(self.node.shape[1]), self.node.shape)
-        np.add.at(result, (place, column), (1 - fraction) * at_samples)
-        np.add.at(result, (place[between] + 1, column[between]), (fraction * at_samples)[between])
+        column = () if self.node.ndim == 1 else (np.broadcast_to(np.arange(self.node.shape[1]), self.node.shape),)
+        np.add.at(result, (np.searchsorted(nodes, self.node), *column), (1 - fraction) * at_samples)
+        after = np.searchsorted(nodes, self.node[between] + 1), *(own[between] for own in column)
+        np.add.at(result, after, (fraction * at_samples)[between])
         return result
 
 
@@ -272,14 +269,14 @@ def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, A
     return float(np.sum(cost)), np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
 
 
-def whiten_against_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Add constant sensor errors of known variance to the noise by which a residual and its derivatives are whitened.
+def whiten_with_extra_errors(columns: Array, spread: Array) -> Array:
+    """Return (I + F F')^(-1/2) X, which whitens rows X of unit covariance for k further, independent errors.
 
-    The first column of `columns` (r, c) is the residual, all other columns are its derivatives. `slopes` (r, m) are the
-    derivatives of whitened measurements with respect to m constant errors, each in units of its standard deviation.
+    X (nr,) or (nr, c) is `columns`, a residual and its derivatives. F (nr, k) is `spread`; column j, if finite, is the
+    change of the residual by one std of error j.
     """
-    left, size, _ = np.linalg.svd(slopes, full_matrices=False)
-    return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
+    left, sizes, _ = np.linalg.svd(spread[:, np.isfinite(spread).all(axis=0)], full_matrices=False)
+    return np.asarray(columns + (left * (1 / np.hypot(1.0, sizes) - 1)) @ (left.T @ columns))
 
 
 def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[SensorMeasurements]) -> Array:
@@ -287,14 +284,9 @@ def whitened_measurement_sensitivities_to_sensor_errors(samples: Sequence[Sensor
 
     Derivatives of the residual, prediction minus measurement, have the opposite sign.
     """
-    parts = [s.weight[:, :, None] * s.output_changes_per_bias_and_clock_std for s in samples]
-    count, before = sum(part.shape[2] for part in parts), 0
-    found, rows = np.zeros((sum(s.n_residuals for s in samples), count)), 0
-    for s, part in zip(samples, parts, strict=True):
-        own = s.decorrelate_residual_rows(part[s.positive_weight_mask])
-        found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own
-        rows, before = rows + s.n_residuals, before + own.shape[1]
-    return found
+    parts = ((s, s.weight[:, :, None] * s.output_changes_per_bias_and_clock_std) for s in samples)
+    blocks = (s.decorrelate_residual_rows(part[s.positive_weight_mask]) for s, part in parts)
+    return np.asarray(scipy.linalg.block_diag(np.zeros((0, 0)), *blocks))
 
 
 def measurements_minus_sensor_error_estimates(

@@ -99,5 +99,4 @@ def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
 
 
 def _with_weight(body: Inertia) -> Inertia:
-    fraction = body.gravity_fraction
-    return replace(body, gravity_fraction=None) if fraction is not None and fraction.is_zero() else body
+    return replace(body, gravity_fraction=ca.SX(1)) if body.gravity_fraction.is_zero() else body

@@ -271,10 +271,13 @@ class SteepestDescent(base.SolverWithCheckedSettings):
 
         # the first trial moves the unknowns by about a tenth of their size
         length = 0.1 * float(np.linalg.norm(problem.unknown_scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
-        for _ in range(self.max_iterations):
+        while True:
             size = np.maximum(np.abs(x), problem.unknown_scales)
             slope = max_abs_projected_gradient(x, gradient, lower, upper, size)
             recorder.record_iterate(cost, x, slope)
+            if len(recorder.history) > self.max_iterations:
+                limit = f"the search reached its limit of {self.max_iterations} iterations (solver.max_iterations)"
+                return ended(base.Status.ITERATION_LIMIT, f"{limit}, as is usual for this method. Use gauss_newton")
             reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
                 return ended(base.Status.CONVERGED, "the projected gradient vanishes")
@@ -293,7 +296,3 @@ class SteepestDescent(base.SolverWithCheckedSettings):
             turned = gradient - before
             if self.first_trial_step_rule == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)
-        size = np.maximum(np.abs(x), problem.unknown_scales)
-        recorder.record_iterate(cost, x, max_abs_projected_gradient(x, gradient, lower, upper, size))
-        limit = f"the search reached its limit of {self.max_iterations} iterations (solver.max_iterations)"
-        return ended(base.Status.ITERATION_LIMIT, f"{limit}, as is usual for this method. Use gauss_newton")

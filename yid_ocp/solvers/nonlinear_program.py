@@ -134,7 +134,7 @@ class ResidualTerm:
     """A residual term of a program's objective, r = weight * (combination @ v - target), with values v of `term`."""
 
     term: MappedFunctionTerm
-    combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
+    combination: ca.DM  # shape (nr, ny K)
     weight_indices: IntArray | None = None  # indices of the weights in p, (nr,); None for weights of one
     target_indices: IntArray | None = None  # indices of the targets in p, (nr,); None for targets of zero
     huber_threshold: float = math.inf  # residual beyond which Huber's loss is linear
@@ -142,23 +142,19 @@ class ResidualTerm:
     @property
     def n_residuals(self) -> int:
         """The number nr of residuals."""
-        return self.term.n_values if self.combination is None else self.combination.size1()
+        return self.combination.size1()
 
-    def _residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
-        """Sparse Jacobian of the residuals r with respect to the term's values; None for the identity."""
-        if self.combination is None and self.weight_indices is None:
-            return None
-        combination = ca.DM.eye(self.n_residuals) if self.combination is None else self.combination
+    def _residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX:
+        """Sparse Jacobian of the residuals r with respect to the term's values."""
         if self.weight_indices is None:
-            return ca.MX(combination)
-        row, _ = combination.sparsity().get_triplet()
+            return ca.MX(self.combination)
+        row, _ = self.combination.sparsity().get_triplet()
         factors = p[self.weight_indices[np.array(row, int)].tolist()]
-        return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
+        return ca.MX(self.combination.sparsity(), factors * ca.MX(ca.DM(self.combination.nonzeros())))
 
     def _symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Residuals r (nr, 1) at the program's variables w and parameters p."""
-        matrix, value = self._residual_jacobian_by_term_values(p), self.term._symbolic_outputs(w, p)
-        result = value if matrix is None else ca.mtimes(matrix, value)
+        result = ca.mtimes(self._residual_jacobian_by_term_values(p), self.term._symbolic_outputs(w, p))
         if self.target_indices is None:
             return result
         target = p[self.target_indices.tolist()]
@@ -168,8 +164,7 @@ class ResidualTerm:
         """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's variables w."""
         entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
-        matrix = self._residual_jacobian_by_term_values(p)
-        return placed if matrix is None else ca.mtimes(matrix, placed)
+        return ca.mtimes(self._residual_jacobian_by_term_values(p), placed)
 
     def _evaluate_loss(self, r: ca.MX) -> ca.MX:
         if math.isinf(self.huber_threshold):
@@ -448,8 +443,7 @@ class NonlinearProgram(ReprMixin):
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if exact:
                 matrix = residual._residual_jacobian_by_term_values(self.p)
-                pull = residual._loss_gradient_by_residual(r)
-                pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
+                pull = ca.mtimes(matrix.T, residual._loss_gradient_by_residual(r))
                 total += self._curvature(residual.term, self.lam_f * pull)
         return total
 

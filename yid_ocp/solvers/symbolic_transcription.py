@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.discrete import OneStepNlpEqualities, one_step_nlp_constraints
+from yid_ocp.integrator.discrete import one_step_nlp_constraints
 from yid_ocp.integrator.statics import joint_hold_spring_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episode_prediction import sensor_not_predictable_at_nodes_error
@@ -53,9 +53,7 @@ from yid_ocp.solvers.nonlinear_program import (
 MIN_RIDGE_FACTOR = 0.1
 
 
-def transcribe(
-    problem: EstimationProblem, initial_unknowns: ArrayLike | None = None, use_compiler: bool | None = None
-) -> NonlinearProgram:
+def transcribe(problem: EstimationProblem, initial_unknowns: ArrayLike | None = None) -> NonlinearProgram:
     """Convert an estimation problem to a nonlinear program with a node at every step.
 
     Equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955. Raises
@@ -65,8 +63,6 @@ def transcribe(
     ----------
     initial_unknowns : array_like, optional, shape (nx,)
         Unknown vector from which the program's initial guess is made. Default: the problem's initial unknowns.
-    use_compiler : bool, optional
-        Whether derivatives of the step equations are compiled if possible. Default: as in the problem's step.
 
     Returns
     -------
@@ -77,10 +73,9 @@ def transcribe(
     """
     problem = _about_zero(problem)
     check_no_effect_changes_inputs(problem, "transcribe")
-    compiled = problem.step.is_compiled if use_compiler is None else use_compiler
     start = problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
     with CASADI_LOCK:
-        return _Maker(problem, compiled).program(start)
+        return _Maker(problem).program(start)
 
 
 def _about_zero(problem: EstimationProblem) -> EstimationProblem:
@@ -146,15 +141,6 @@ class _Places(NamedTuple):
         return np.hstack([self.torque.T, self.gain.T, self.reference.T])
 
 
-class _FreeParameterSymbols(NamedTuple):
-    """Symbols of the parameters theta: free ones, nominal values of all, and theta with free symbols inserted."""
-
-    names: tuple[str, ...]
-    free: ca.SX
-    nominal: ca.SX
-    theta: ca.SX
-
-
 class _DrivenStage(NamedTuple):
     """The equations of step k as a function of v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
 
@@ -170,63 +156,19 @@ class _DrivenStage(NamedTuple):
     torque: tuple[ca.SX, ca.SX]
 
 
-def _driven_stage(
-    stage: OneStepNlpEqualities,
-    freed: _FreeParameterSymbols,
-    followed: Sequence[int],
-    momentum: Array,
-    noisy: bool,
-    use_compiler: bool,
-) -> _DrivenStage:
-    """The equations of a step, with its tracking filter and torque errors, if it has them.
-
-    The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. The gain K_k is absent if
-    encoders are measurements; torque errors w_k, b and angle errors v_k are absent if torques are exact. `followed`
-    are indices of the state. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque.
-    """
-    nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
-    before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
-    nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
-    reference, matrix = ca.SX.sym("reference", len(index)), ca.reshape(gain, len(index), nu).T
-    by_errors = ca.SX(nu, 0)
-    if noisy:
-        # the measured momentum contains half the impulse of the previous step, whose w is replaced by that of this step
-        late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
-        by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
-    errors, by_before = ca.SX.sym("errors", by_errors.shape[1]), ca.SX(nu, nx)
-    torque = nominal + ca.mtimes(by_errors, errors)
-    if index:
-        torque -= ca.mtimes(matrix, before[index] - reference)
-        by_before[:, index] = -matrix
-    symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
-    by_free = stage.residual_and_effort_jacobians_by_parameters(freed.names)
-    slopes = (stage.residual_jacobians, stage.effort_jacobians)
-    made = []
-    for value, own, by in zip((stage.residual, stage.prescribed_effort), by_free, slopes, strict=True):
-        parts = [value, own, *(by[name] for name in ("x0", "x1", "lam", "u"))]
-        value, own, first, second, pull, by_u = ca.substitute(parts, symbols, [before, after, lam, torque, freed.theta])
-        driven = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
-        made.append((value, ca.horzcat(own, first + driven[0], second, pull, driven[1])))
-    (rows, by_v), effort = made
-    by_torque = ca.horzcat(ca.SX(nu, len(freed.names)), by_before, ca.SX(nu, nx + m), by_errors)
-    v, data = ca.vertcat(freed.free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)
-    function = LocalVariableFunction("step", [v, data, freed.nominal], rows, by_v, use_compiler)
-    return _DrivenStage(function, v, data, before, after, effort, (torque, by_torque))
-
-
 class _Maker:
     """A builder of the program: it lays out the unknowns and parameters of a problem, and makes the terms."""
 
-    def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
-        self._problem, self._compiled = problem, compiled
+    def __init__(self, problem: EstimationProblem) -> None:
+        self._problem = problem
         self._step, self._sizes = problem.step, problem.step.sizes
         self._names = problem.unknowns.free_parameter_names
         self._w, self._p = ProgramVectorLayout(), ProgramVectorLayout()
         system = problem.system
-        free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
-        theta = ca.SX(fixed)
-        theta[[system.parameters.index(name) for name in self._names]] = free
-        self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
+        # symbols of the free parameters, of nominal values of all, and all with the free symbols inserted
+        self._free, self._nominal = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
+        self._theta = ca.SX(self._nominal)
+        self._theta[[system.parameters.index(name) for name in self._names]] = self._free
         self._stage = one_step_nlp_constraints(self._step.equations, self._step.time_step)
         self._stages: dict[tuple[bool, bool], _DrivenStage] = {}
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
@@ -315,8 +257,46 @@ class _Maker:
             feedback, shift = episode.tracking_feedback, self._problem.model_functions.effect_momentum_calculator
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
             momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
-            self._stages[key] = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
+            self._stages[key] = self._driven_stage(followed, momentum, is_noisy)
         return self._stages[key]
+
+    def _driven_stage(self, followed: Sequence[int], momentum: Array, noisy: bool) -> _DrivenStage:
+        """The equations of a step, with its tracking filter and torque errors, if it has them.
+
+        The applied torque is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k. The gain K_k is absent if
+        encoders are measurements; torque errors w_k, b and angle errors v_k are absent if torques are exact. `followed`
+        are indices of the state. `momentum` (nu, nu) is the derivative of the followed momenta by the previous torque.
+        """
+        stage = self._stage
+        nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
+        before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
+        nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
+        reference, matrix = ca.SX.sym("reference", len(index)), ca.reshape(gain, len(index), nu).T
+        by_errors = ca.SX(nu, 0)
+        if noisy:
+            # the measured momentum contains half the impulse of the previous step, whose w is replaced by this step's
+            late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
+            by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
+        errors, by_before = ca.SX.sym("errors", by_errors.shape[1]), ca.SX(nu, nx)
+        torque = nominal + ca.mtimes(by_errors, errors)
+        if index:
+            torque -= ca.mtimes(matrix, before[index] - reference)
+            by_before[:, index] = -matrix
+        symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
+        expressions = [before, after, lam, torque, self._theta]
+        by_free = stage.residual_and_effort_jacobians_by_parameters(self._names)
+        slopes = (stage.residual_jacobians, stage.effort_jacobians)
+        made = []
+        for value, own, by in zip((stage.residual, stage.prescribed_effort), by_free, slopes, strict=True):
+            parts = [value, own, *(by[name] for name in ("x0", "x1", "lam", "u"))]
+            value, own, first, second, pull, by_u = ca.substitute(parts, symbols, expressions)
+            driven = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
+            made.append((value, ca.horzcat(own, first + driven[0], second, pull, driven[1])))
+        (rows, by_v), effort = made
+        by_torque = ca.horzcat(ca.SX(nu, len(self._names)), by_before, ca.SX(nu, nx + m), by_errors)
+        v, data = ca.vertcat(self._free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)
+        function = LocalVariableFunction("step", [v, data, self._nominal], rows, by_v, self._step.is_compiled)
+        return _DrivenStage(function, v, data, before, after, effort, (torque, by_torque))
 
     def _erring(self, episode: Episode) -> tuple[IntArray, IntArray, list[ResidualTerm]]:
         """Indices of each step's torque errors and of the errors of the first angles, and their priors."""
@@ -364,7 +344,7 @@ class _Maker:
             rest = statics.symbolic_equations
             sought, held = rest.inputs[0], rest.inputs[2]
             stiffness = joint_hold_spring_stiffness(problem.system, bool(problem.system.driven))
-            values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
+            values = [ca.SX(stiffness), self._theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()
             errors = ca.SX.sym("errors", 3 * len(places.first))
@@ -373,8 +353,8 @@ class _Maker:
                 moved = posture - ca.vertcat(errors[:nu], ca.SX(ca.DM.zeros(posture.numel() - nu)))
                 true = held - errors[nu : 2 * nu] - errors[2 * nu :]
                 balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
-            v = ca.vertcat(self._freed.free, sought, first, errors)
-            inputs = [v, ca.vertcat(posture, held), self._freed.nominal]
+            v = ca.vertcat(self._free, sought, first, errors)
+            inputs = [v, ca.vertcat(posture, held), self._nominal]
             known = [problem.system.mechanism.joint_names[k] for k in statics.known_coordinates]
             given = self._p.append_block(f"posture[{name}]", episode.initial_known_coordinates, known)
             wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
@@ -438,8 +418,8 @@ class _Maker:
                 made = self._loaded(function, self._driven(episode))
             else:
                 q, z = ca.SX.sym("q", self._sizes["n"]), ca.SX.sym("z", self._sizes["nz"])
-                read = function(q=q, z=z, theta=self._freed.theta)
-                inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
+                read = function(q=q, z=z, theta=self._theta)
+                inputs = [ca.vertcat(self._free, q, z), ca.SX(0, 1), self._nominal]
                 slopes = ca.horzcat(read["by_theta"], read["by_q"], read["by_z"])
                 made = LocalVariableFunction("reading", inputs, read["y"], slopes)
             self._sensors[key] = made, loaded
@@ -454,13 +434,13 @@ class _Maker:
         for index, (values, by_these) in zip(at, (step.effort, step.torque), strict=True):
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
-        read = function(q=node[:n], z=node[2 * n :], load=load, theta=self._freed.theta)
+        read = function(q=node[:n], z=node[2 * n :], load=load, theta=self._theta)
         y = read["y"]
         at_node = ca.horzcat(read["by_q"], ca.SX(y.numel(), n), read["by_z"])
         rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
         slopes = ca.horzcat(read["by_theta"], (1 - last) * at_node, last * at_node, rest)
         slopes += ca.mtimes(read["by_load"], by_v)
-        inputs = [step.v, ca.vertcat(step.data, last), self._freed.nominal]
+        inputs = [step.v, ca.vertcat(step.data, last), self._nominal]
         return LocalVariableFunction("reading_under_load", inputs, y, slopes)
 
     def _priors(self, columns: dict[int, int]) -> list[ResidualTerm]:

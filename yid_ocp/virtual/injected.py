@@ -103,7 +103,7 @@ def typical_friction_amplitude_range(effect: EffectBase, system: System) -> tupl
     low, high = _ORDINARY_FRICTION[effect.kind]
     if effect.definitions[0].unit == "1":
         return low, high
-    rated = min(system.mechanism.joints[system.mechanism.joint_index(effect.location)].effort_limit, _MAX_RATED_EFFORT)
+    rated = min(system.mechanism.joint(effect.location).effort_limit, _MAX_RATED_EFFORT)
     return low * rated, high * rated
 
 

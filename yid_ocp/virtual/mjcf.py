@@ -103,10 +103,10 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
         "damping": (*(spring.damping for spring in system.elastic_joints), *system.joint_damping.values()),
         "geometry": (part for placement in placements for part in (placement.rotation, placement.translation)),
         "inertia": (part for body in bodies for part in (body.mass, body.center_of_mass, body.inertia_about_com)),
-        "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
+        "weight": (body.gravity_fraction for body in bodies),
         "gravity": (system.gravity,),
         "grasp": (part for grasp in held for part in (grasp.held_orientation, grasp.holder_offset, grasp.axial_slip)),
-        "grasp_compliance": (part for g in held for part in (g.compliance, g.relaxation_time) if part is not None),
+        "grasp_compliance": (part for grasp in held for part in (grasp.compliance, grasp.relaxation_time)),
         "sprung_joint": system.joint_compliances.values(),
         "servo": (
             part
@@ -331,14 +331,14 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     """The tree with bodies of full weight, and the gravity fraction of bodies with another weight, by joint."""
     weights: dict[str, float] = {}
     for joint in tree.joints:
-        shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
+        shares = {float(body.gravity_fraction) for body in joint.bodies}
         if len(shares) > 1:
             said = ", ".join(f"{share:.4g}" for share in sorted(shares))
             what, where = f"bodies of one joint have {said} times the weight of their mass", f"joint '{joint.name}'"
             hint = "leave out one of the effects that change weights (model.effects)"
             raise ModelError(what, where=where, allowed="one factor for all bodies of a joint", hint=hint)
         weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
-    return tree.with_gravity_fraction(None), weights
+    return tree.with_gravity_fraction(ca.SX(1)), weights
 
 
 def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]:
@@ -367,7 +367,7 @@ def _add_grasps(system: System, value: CasadiEvaluator, root: Element, time_step
         compliance = float(value(grasp.compliance)[0])
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
-            relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
+            relaxation = float(value(grasp.relaxation_time)[0])
             tendons = root.find("tendon")
             tendons = SubElement(root, "tendon") if tendons is None else tendons
             spring = SubElement(tendons, "spatial", name=f"grasp_{grasp.name}", springlength="0")
