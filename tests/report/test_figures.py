@@ -107,10 +107,10 @@ def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
     t = np.array([0.0, 0.1, 0.2])
     points = PointGroup("camera", ("w_T1",), t, np.ones((3, 1, 3)))
     theta = single_arm.parameters.vector()
-    alone = animation.measured_motion_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
+    [alone] = animation.measured_motion_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
     assert [motion.name for motion in alone.motions] == ["measured"]
     other = JointGroup(("elsewhere",), t, np.zeros((3, 1)))
-    assert animation.measured_motion_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
+    assert animation.measured_motion_animation("a", single_arm, theta, Recording(other, (), name="a")) == []
 
 
 @pytest.fixture(scope="module")

@@ -199,8 +199,6 @@ def _dropped(recording: Recording) -> Iterator[Issue]:
         return
     steps = np.diff(joints.t)
     base = float(np.percentile(steps, 2))
-    if base <= 0:
-        return
     count = np.rint(steps / base)
     even = float(np.mean(np.abs(steps / base - count) < 0.1 * count))
     small = count[count < 50]  # longer ones are gaps

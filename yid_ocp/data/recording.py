@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprTexts, count_with_noun
 from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
-from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, channel_specs_for_group_name
+from yid_ocp.sensors.base import CHANNEL_KINDS, EffortSamplingKind, RecordedChannelSpec, channel_specs_for_group_name
 
 TimestampKind = Literal["recorded", "nominal"]
 
@@ -279,6 +279,13 @@ class Recording(ReprMixin):
         own += [group.name for group in self.points]
         own += [f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity]
         return tuple(own)
+
+    @property
+    def mounted_sensor_channels(self) -> list[tuple[str, SensorChannelGroup, RecordedChannelSpec]]:
+        """Recorded vectors of sensors on a link: key under `sensors` in the settings, group and kind of channel."""
+        pairs = ((group, kind) for group in self.channel_groups for kind in channel_specs_for_group_name(group.name))
+        found = ((g, kind) for g, kind in pairs if kind.components and kind.quantity in g.values_by_quantity)
+        return [(f"{group.name}.{kind.quantity}", group, kind) for group, kind in found]
 
     @property
     def joint_names(self) -> tuple[str, ...]:

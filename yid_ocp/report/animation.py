@@ -291,8 +291,8 @@ def animation_of_trajectories(
 
 def measured_motion_animation(
     title: str, system: System, theta: Array, recording: Recording, has_straight_object: bool = False
-) -> AnimationData | None:
-    """Return the animation of a recording without predictions, or None if the recording holds no positions.
+) -> list[AnimationData]:
+    """Return a list with the animation of a recording without predictions, empty if the recording has no positions.
 
     With `has_straight_object`, the model at the recorded angles is drawn, too, with an undeformed object.
     """
@@ -300,11 +300,11 @@ def measured_motion_animation(
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))
     if not (motion.sticks or motion.point_indices):
-        return None
+        return []
     if not has_straight_object:
-        return AnimationData(title, t, (motion,))
+        return [AnimationData(title, t, (motion,))]
     unbent = replace(told, name="undeformed model at the recorded angles")
-    return AnimationData(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))
+    return [AnimationData(title, t, (_model_motion(unbent, t, _with_recorded_angles(told, recording, t)), motion))]
 
 
 def _with_recorded_angles(told: ConfigurationTrajectory, recording: Recording, t: Array) -> Array:

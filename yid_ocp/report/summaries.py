@@ -415,9 +415,8 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     reached = [f"{k.partition(' [')[0]} of {', '.join(n)}" for k, n in result["limits_reached"].items()]
     text = f"these limits, and exceeds none: {', '.join(reached)}" if reached else "none of its limits"
     yield f"The motion reaches {text}."
-    for words in dict.fromkeys(result["unseen"].values()):
-        names = ", ".join(name for name, own in result["unseen"].items() if own == words)
-        yield f"No motion that was tried lets a sensor observe {names}. For this, {words}."
+    for words, unobserved in grouped((words, name) for name, words in result["unseen"].items()).items():
+        yield f"No motion that was tried lets a sensor observe {', '.join(unobserved)}. For this, {words}."
     unseen = tuple(f"{name} is" for name in result["unseen"])
     yield from (f"This motion leaves open: {words}." for words in result["open"] if not words.startswith(unseen))
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""

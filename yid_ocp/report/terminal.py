@@ -279,14 +279,13 @@ def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) ->
 def importable_file_contents_lines(contents: FilePreview) -> list[str]:
     """Return lines of text that describe a file of another tool: a table of what `import` finds, and notes."""
     rows: TableRows = [("source", "type", "samples", "rate [Hz]", "imported as", "note")]
-    alike: dict[tuple[str, ...], list[Sequence[str]]] = {}  # rows that only differ in a number
     for own in contents.sources:
         rate = f"{own.mean_rate:.4g}" if math.isfinite(own.mean_rate) else ""
         kind, _, of = own.imported_as.partition(" ")
         becomes = f"{kind} {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "not imported"
         rows.append((own.name, own.kind, str(own.n_samples), rate, becomes, own.note))
-        alike.setdefault(tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in rows[-1]), []).append(rows[-1])
-    for group in alike.values():
+    # rows that only differ in a number
+    for group in grouped((tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in row), row) for row in rows[1:]).values():
         first, *others = group
         names = [abbreviated_names_text(list(dict.fromkeys(cells)), math.inf) for cells in zip(*group, strict=True)]
         if others and not any(", " in name and name != cell for name, cell in zip(names, first, strict=True)):

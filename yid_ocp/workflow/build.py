@@ -35,7 +35,6 @@ from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import (
     add_setting_location_to_errors,
@@ -146,11 +145,9 @@ def are_arm_states_estimated(run: RunSettings) -> bool:
     if run.model.arms.mode != "prescribed" or not run.model.grasp or (item and item.parent_frame_and_root_pose[0]):
         return False
     recordings = read_recordings_of_role(run)
-    for group in (group for recording in recordings for group in recording.channel_groups):
-        for kind in (kind for kind in channel_specs_for_group_name(group.name) if kind.components):
-            choice = run.sensors.get(f"{group.name}.{kind.quantity}", SensorOptions())
-            if kind.quantity in group.values_by_quantity and choice.use is not False:
-                return False
+    mounted = [key for recording in recordings for key, *_ in recording.mounted_sensor_channels]
+    if any(run.sensors.get(key, SensorOptions()).use is not False for key in mounted):
+        return False
     return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 
 

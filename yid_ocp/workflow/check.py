@@ -173,8 +173,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[AnimationData
             scenes.append(animation_of_trajectories(episode.name, [told], episode.recording))
         else:
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            alone = measured_motion_animation(episode.name, problem.system, theta, episode.recording)
-            scenes += [] if alone is None else [alone]
+            scenes += measured_motion_animation(episode.name, problem.system, theta, episode.recording)
     return scenes
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import maximum_filter1d
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import mean_sample_rate, median_sample_period, noise_or_quantization_std
 from yid_ocp.data.foreign_formats import ESTIMATED_WRENCH_GROUP_NAME
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.model import FlexibleSegment, Mechanism
 from yid_ocp.model.kinematics import forward_kinematics
@@ -21,7 +21,6 @@ from yid_ocp.model.mechanism import rotation_from_rpy
 from yid_ocp.model.urdf import joint_damping_and_friction, read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import RecordedChannelSpec, channel_specs_for_group_name
 from yid_ocp.sensors.joints import is_noise_std_stated
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "grip", "flange", "hand", "link8")
@@ -503,7 +502,7 @@ def _along(name: str, percent: float) -> str:
 def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[str, tuple[_PointPlacement, ...]]:
     """Frames of wrist sensors and inertial units: the frame of the same name, else, for a wrist, the holder."""
     found: dict[str, tuple[_PointPlacement, ...]] = {}
-    for key, group, channel in _mounted_channels(recording):
+    for key, group, channel in recording.mounted_sensor_channels:
         other = ("", "no link has this name. To use it, set {frame_by_recorded_name: {NAME: FRAME}, use: true}")
         if channel.group == "wrist":
             other = (holder, "a wrist sensor usually carries this link. If it does not, set frame_by_recorded_name")
@@ -513,13 +512,6 @@ def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[s
             for name, moves in own.items()
         )
     return found
-
-
-def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, RecordedChannelSpec]]:
-    for group in recording.channel_groups:
-        for kind in channel_specs_for_group_name(group.name):
-            if kind.components and kind.quantity in group.values_by_quantity:
-                yield f"{group.name}.{kind.quantity}", group, kind
 
 
 def _straight(branches: Sequence[FlexibleSegment]) -> dict[str, Array]:
@@ -554,7 +546,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
         if values is not None:
             is_stated = is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions())
             found[f"joints.{channel}"] = _channel_noise(recorded.t, values[:, at], least, unit, is_stated, joints)
-    for key, group, kind in _mounted_channels(recording):
+    for key, group, kind in recording.mounted_sensor_channels:
         values, stated = group.values_by_quantity[kind.quantity], group.noise_and_bias_stds_by_attribute
         columns = values.reshape(len(values), -1)
         found[key] = _channel_noise(group.t, columns, 1e-3, kind.unit, kind.std_attribute_names[0] in stated)

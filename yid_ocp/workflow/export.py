@@ -104,11 +104,9 @@ class _CalibratedModel:
     parameter_values: Mapping[str, float]
     parameter_stds: Mapping[str, float | None]  # None for an estimate that cannot be found or is in doubt
 
-    def system(self, labels: Iterable[str] | None = None, nominal: bool = False) -> System:
-        """Return the system with the effects `labels` (default: all); if `nominal`, only those of the nominal model."""
+    def system(self, labels: Iterable[str], nominal: bool = False) -> System:
+        """Return the system with the effects `labels`; if `nominal`, only with those of them in the nominal model."""
         run = self.nominal_settings if nominal else self.settings
-        if labels is None:
-            return build_system(run)
         kept = {"", *labels}
         effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
         # names of parameters start with that of their effect
@@ -161,7 +159,10 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         what, hint = f"{out.name} already exists, and `export` overwrites nothing", "choose another --out, or remove it"
         raise OutputError(what, where=str(out), allowed="a file that does not exist yet", hint=hint)
     progress.begin_stage("building the model")
-    full, unknown = calibrated.system(), [n for n, std in calibrated.parameter_stds.items() if std is None]
+    full, unknown = (
+        build_system(calibrated.settings),
+        [n for n, std in calibrated.parameter_stds.items() if std is None],
+    )
     if form == "yaml":
         chosen = settings_by_parameter_name(calibrated.settings, full.parameters)
         for name in calibrated.parameter_stds:

@@ -230,7 +230,6 @@ class _IdentifiabilityTasks:
 
     def _done(self, function: Callable[..., Any], tasks: Mapping[str, Mapping[str, Any]]) -> list[Any]:
         listed = [Task(name, {"common": self.common, **own}) for name, own in tasks.items()]
-        self.results_folder.parent.mkdir(parents=True, exist_ok=True)
         report = self.progress.report_parts_done
         return require_task_values(run_tasks(function, listed, self.results_folder, self.workers, report))
 

@@ -263,11 +263,11 @@ def _write_picture(out: Path, recording: Recording, result: Mapping[str, Any]) -
     """Write a page with the recorded motion, undeformed object, frames and points. Returns its path if there is one."""
     run, page = load_config(out), out.with_suffix(".html")
     values = (system := build_system(run)).parameters.vector()
-    scene = measured_motion_animation(recording.name, system, values, recording, has_straight_object=True)
-    if scene is None:
+    scenes = measured_motion_animation(recording.name, system, values, recording, has_straight_object=True)
+    if not scenes:
         return None
     title = f"{out.stem}: what init guessed"
-    data = ReportData(title, run.description, result, animations=[scene], robot=run.model.robot)
+    data = ReportData(title, run.description, result, animations=scenes, robot=run.model.robot)
     return str(page) if write_report(page, data) else None
 
 

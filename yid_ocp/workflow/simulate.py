@@ -80,8 +80,7 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
     experiment = VirtualExperimentSettings(simulation=simulation, seed=seed, recording_name=run.name)
     made = run_virtual_experiment(system, None, replace(experiment, description=run.description))
-    alone = measured_motion_animation("recorded", system, system.parameters.vector(), made)
-    return made, [] if alone is None else [alone]
+    return made, measured_motion_animation("recorded", system, system.parameters.vector(), made)
 
 
 def _predicted(run: RunSettings, system: System, progress: Progress, seed: int | None) -> _Made:

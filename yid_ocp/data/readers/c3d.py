@@ -6,9 +6,10 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import chain, count, takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +23,6 @@ from yid_ocp.files import file_sha256
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
 """Lists in the parameter group POINT whose labels are results of a body model instead of positions."""
 _LENGTH_UNITS = ("m", "cm", "mm")
-
-
-class _Markers(NamedTuple):
-    """Markers of a file in its own unit: names, times, positions (N, np, 3), NaN if unseen; and other content."""
-
-    names: tuple[str, ...]
-    t: Array
-    position: Array
-    unit: str
-    others: tuple[base.TopicOrColumnSummary, ...]
 
 
 @base.READERS.register(".c3d")
@@ -53,11 +44,10 @@ def _read_c3d(
     """
     path = Path(path)
     digest = file_sha256(path)
-    found = _markers(path)
-    own = {"points": found.unit} if found.unit else {}
-    marked = found.names, found.t, found.position
-    group = PointGroup("points", *marked, None, point_sensor_name, point_frame, None, "nominal")
-    notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
+    seen, unit, others = _markers(path)
+    own = {"points": unit} if unit else {}
+    group = replace(seen, sensor_name=point_sensor_name, frame=point_frame)
+    notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
     options = base.JointPointAndUnitOptions(point_names=point_names, units={**own, **(units or {})})
     return base.convert_to_si_and_validate(raw, str(path), options)
@@ -66,18 +56,19 @@ def _read_c3d(
 @base.FILE_PREVIEWERS.register(".c3d")
 def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
     path = Path(path)
-    found = _markers(path)
-    rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
+    group, unit, others = _markers(path)
+    rate = 1.0 / float(group.t[1] - group.t[0]) if len(group.t) > 1 else math.nan
     sources = []
-    for i, name in enumerate(found.names):
-        seen = np.isfinite(found.position[:, i]).all(axis=1)
+    for i, name in enumerate(group.names):
+        seen = np.isfinite(group.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.TopicOrColumnSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
-    notes = [f"the file states the unit {found.unit}" if found.unit else "no unit is stated; for mm, add --units mm"]
-    return base.FilePreview((*sources, *found.others), {"point_names": {n: n for n in found.names}}, tuple(notes))
+    notes = [f"the file states the unit {unit}" if unit else "no unit is stated; for mm, add --units mm"]
+    return base.FilePreview((*sources, *others), {"point_names": {n: n for n in group.names}}, tuple(notes))
 
 
-def _markers(path: Path) -> _Markers:
+def _markers(path: Path) -> tuple[PointGroup, str, tuple[base.TopicOrColumnSummary, ...]]:
+    """Return the markers of a file in its own unit (NaN if unseen), this unit, and other content."""
     ezc3d = import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d")
     check_readable_in_child_process(path, _complaint, "C3D")
     try:
@@ -115,7 +106,7 @@ def _markers(path: Path) -> _Markers:
         others.append(base.TopicOrColumnSummary(name, "marker", count, rate, "", reason))
     others += [base.TopicOrColumnSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names, t = _short([labels[i] for i in kept]), np.arange(len(position)) / rate
-    return _Markers(names, t, position[:, kept], unit, tuple(others))
+    return PointGroup("points", names, t, position[:, kept], clock="nominal"), unit, tuple(others)
 
 
 def _complaint(path: Path) -> str:

@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
@@ -52,11 +52,6 @@ class _Info(BaseModel):
     robot_type: str | None = None
 
 
-class _Dataset(NamedTuple):
-    folder: Path
-    info: _Info
-
-
 @base.READERS.register("LeRobot dataset")
 def _read_lerobot_episode(
     path: str | os.PathLike[str],
@@ -74,52 +69,52 @@ def _read_lerobot_episode(
     clock. `notes` lists images and other features. Options are those of `JointPointAndUnitOptions`. Raises `DataError`
     without `pyarrow`, for an unknown dataset or episode, or if `validated_recording` refuses the result.
     """
-    dataset = _dataset(Path(path))
-    table, file = _episode(dataset, episode)
-    names, channels, left = _channels(dataset, table)
-    t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
-    where = f"{dataset.folder}, episode {episode}"
+    folder, info = Path(path), _info(Path(path))
+    table, file = _episode(folder, info, episode)
+    names, channels, left = _channels(folder, info, table)
+    t, source = _times(info, table), f"{folder.name}, episode {episode}"
+    where = f"{folder}, episode {episode}"
     if (units or {}).get("position") == "deg":
         advice = "if the model has this joint, set model.arms.locked_joints"
         left |= {name: f"{_PERCENT}; {advice}: {{{name}: ANGLE}} [rad]" for name in _grippers(names)}
         kept = [i for i, name in enumerate(names) if name not in left]
         names, channels = tuple(names[i] for i in kept), {key: values[:, kept] for key, values in channels.items()}
     group = JointGroup(names, t - t[0], clock="nominal", **channels)
-    own = source, f"{dataset.folder.name}_{episode:06d}", file_sha256(file)
+    own = source, f"{folder.name}_{episode:06d}", file_sha256(file)
     notes = tuple(f"{name} was left out ({why})" for name, why in left.items())
     raw = Recording(group, (), description, *own, notes=notes)
     if "position" not in (units or {}):
-        _check_are_radians(group, dataset, where)
+        _check_are_radians(group, info, where)
     options = base.JointPointAndUnitOptions(joints, None, units, torque_constants, gear_ratios)
     return base.convert_to_si_and_validate(raw, where, options)
 
 
 @base.FILE_PREVIEWERS.register("LeRobot dataset")
 def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
-    dataset = _dataset(Path(path))
-    table, _ = _episode(dataset, 0)
-    names, channels, left = _channels(dataset, table)
-    group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
+    folder, info = Path(path), _info(Path(path))
+    table, _ = _episode(folder, info, 0)
+    names, channels, left = _channels(folder, info, table)
+    group = JointGroup(names, _times(info, table), clock="nominal", **channels)
     sources, (units, guesses) = [], base.guess_non_si_units(Recording(group))
-    grippers = _grippers(names) if "position" in units or _NEVER_RADIANS.search(dataset.info.robot_type or "") else []
+    grippers = _grippers(names) if "position" in units or _NEVER_RADIANS.search(info.robot_type or "") else []
     names = tuple(name for name in names if name not in grippers)
     by_name = {_ACTION: "position_command", _STATE: f"joints {', '.join(names)}"}
-    for name, feature in dataset.info.features.items():
+    for name, feature in info.features.items():
         note = f"without {', '.join(grippers)}: {_PERCENT}" if name == _STATE and grippers else ""
         own = ("", left[name]) if name in left else (by_name.get(name, _CHANNELS.get(name, "")), note)
         if name == "frame_index":
             own = ("t", "")
         elif name in _BOOKKEEPING:
             own = ("", "numbers frames and tasks")
-        sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
+        sources.append(base.TopicOrColumnSummary(name, feature.dtype, len(group.t), info.fps, *own))
     if "position" in units and _widest(group) <= _MAX_NORMALISED:  # degrees or normalised: reading asks which
         del units["position"]
         guesses = tuple(guess for guess in guesses if not guess.startswith("angles"))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
-    said = f"{dataset.info.total_episodes} episodes at {dataset.info.fps:g} Hz, {dataset.info.codebase_version}"
-    robot = dataset.info.robot_type
+    said = f"{info.total_episodes} episodes at {info.fps:g} Hz, {info.codebase_version}"
+    robot = info.robot_type
     return base.FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
@@ -134,9 +129,9 @@ def _widest(group: JointGroup) -> float:
     return float(np.nanmax(np.abs(group.position[:, arm]), initial=0.0))
 
 
-def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None:
+def _check_are_radians(group: JointGroup, info: _Info, where: str) -> None:
     """Raise `DataError` if angles are in degrees or normalised units, or the robot is never recorded in radians."""
-    widest, robot = _widest(group), dataset.info.robot_type or ""
+    widest, robot = _widest(group), info.robot_type or ""
     of = f", and LeRobot does not record a {robot} in radians" if _NEVER_RADIANS.search(robot) else ""
     if widest <= _MAX_RADIANS and not of:
         return
@@ -148,7 +143,7 @@ def _check_are_radians(group: JointGroup, dataset: _Dataset, where: str) -> None
     raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
-def _dataset(folder: Path) -> _Dataset:
+def _info(folder: Path) -> _Info:
     file = folder / "meta" / "info.json"
     where, hint = str(file), "convert the dataset again with the conversion script of LeRobot"
     try:
@@ -166,27 +161,27 @@ def _dataset(folder: Path) -> _Dataset:
     raise_data_error_unless(version in _VERSIONS, what, place, ", ".join(_VERSIONS), hint)
     what, hint = f"the dataset has no {_STATE} (measured joint positions)", "record it with the state of the robot"
     raise_data_error_unless(_STATE in info.features, what, f"{where}: features", f"features with {_STATE}", hint)
-    return _Dataset(folder, info)
+    return info
 
 
-def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
+def _episode(folder: Path, info: _Info, episode: int) -> tuple[Mapping[str, Array], Path]:
     """Columns of one episode, shape (frames, numbers of a frame), and its file."""
     names = "pyarrow", "pyarrow.parquet"
     arrow, parquet = (import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow") for name in names)
-    where = f"{dataset.folder}, episode {episode}"
-    last = dataset.info.total_episodes - 1
+    where = f"{folder}, episode {episode}"
+    last = info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
     is_known, hint = episode >= 0 and (last < 0 or episode <= last), f"choose for example --episode {max(last, 0)}"
-    raise_data_error_unless(is_known, f"there is no episode {episode}", str(dataset.folder), allowed, hint)
-    wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
+    raise_data_error_unless(is_known, f"there is no episode {episode}", str(folder), allowed, hint)
+    wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in info.features]
     columns = [*wanted, "frame_index", "episode_index"]
-    for file in _files(dataset, episode):
+    for file in _files(folder, info, episode):
         try:
             held = parquet.ParquetFile(check_input_file(file))
             _check_size(held.metadata, columns, str(file))
             _check_types(held.schema_arrow, columns, str(file))
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
-            found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
+            found = {name: _matrix(table[name].combine_chunks(), name, folder) for name in columns}
         except (arrow.ArrowException, OSError, KeyError, ValueError) as error:
             what = "the table of the episode cannot be read, because it is damaged or not a parquet file"
             hint, allowed = "download or copy the file again", f"a parquet file with {', '.join(columns)}"
@@ -197,14 +192,14 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
     raise DataError(what, where=where, allowed="an episode whose file is in the folder", hint=hint)
 
 
-def _files(dataset: _Dataset, episode: int) -> list[Path]:
+def _files(folder: Path, info: _Info, episode: int) -> list[Path]:
     """Tables that may contain an episode: its own one in version 2, any in version 3."""
-    pattern, chunk = dataset.info.data_path, episode // (dataset.info.chunks_size or 1000)
+    pattern, chunk = info.data_path, episode // (info.chunks_size or 1000)
     if "episode_index" not in pattern:
-        return sorted(dataset.folder.glob("data/*/*.parquet"))
+        return sorted(folder.glob("data/*/*.parquet"))
     if _EPISODE_PATH.fullmatch(pattern) and ".." not in pattern:
-        return [dataset.folder / pattern.format(episode_chunk=chunk, episode_index=episode)]
-    where = f"{dataset.folder / 'meta' / 'info.json'}: data_path"
+        return [folder / pattern.format(episode_chunk=chunk, episode_index=episode)]
+    where = f"{folder / 'meta' / 'info.json'}: data_path"
     allowed = "a path in the dataset with {episode_chunk:03d} and {episode_index:06d}"
     hint = "write data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     what = f"data_path is '{pattern}', which does not lead to the file of an episode"
@@ -233,14 +228,16 @@ def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
         raise_data_error_unless(is_numeric, what, where, "numbers, or lists of numbers", hint)
 
 
-def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
-    return table["frame_index"][:, 0] / dataset.info.fps
+def _times(info: _Info, table: Mapping[str, Array]) -> Array:
+    return table["frame_index"][:, 0] / info.fps
 
 
-def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str, ...], dict[str, Any], dict[str, str]]:
+def _channels(
+    folder: Path, info: _Info, table: Mapping[str, Array]
+) -> tuple[tuple[str, ...], dict[str, Any], dict[str, str]]:
     """Names of the joints, arrays (frames, joints) by channel, and the reason for every omitted feature."""
     state = table[_STATE]
-    entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
+    entries = [_entry(name) for name in _names(info, _STATE, state.shape[1])]
     joints = tuple(dict.fromkeys(joint for joint, channel in entries if channel == "position"))
     channels: dict[str, Any] = {}
     for channel in dict.fromkeys(channel for _, channel in entries):
@@ -248,18 +245,18 @@ def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str,
         lacking = ", ".join(joint for joint in joints if (joint, channel) not in entries)
         what = f"{_STATE} has the {channel} of only {len(at)} of {len(joints)} joints; it lacks {lacking}"
         allowed, hint = "every channel for all joints", f"record the {channel} of all joints, or of none"
-        raise_data_error_unless(len(at) == len(joints), what, f"{dataset.folder}: {_STATE}", allowed, hint)
+        raise_data_error_unless(len(at) == len(joints), what, f"{folder}: {_STATE}", allowed, hint)
         channels[channel] = state[:, at]
     left = {}
-    for name in dataset.info.features:
+    for name in info.features:
         if name == _STATE or name in _BOOKKEEPING:
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:
-            left[name] = f"type '{dataset.info.features[name].dtype or 'unknown'}'; only values of joints are imported"
+            left[name] = f"type '{info.features[name].dtype or 'unknown'}'; only values of joints are imported"
             continue
         values = table[name]
-        named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
+        named = [_entry(entry)[0] for entry in _names(info, name, values.shape[1])]
         if set(joints) <= set(named):
             channels.setdefault(target, values[:, [named.index(joint) for joint in joints]])
         else:
@@ -281,8 +278,8 @@ def _matrix(column: Any, name: str, folder: Path) -> Array:
     return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 
-def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
-    said = dataset.info.features[feature].names
+def _names(info: _Info, feature: str, count: int) -> list[str]:
+    said = info.features[feature].names
     if isinstance(said, Mapping):
         parts = [list(part) if isinstance(part, (list, tuple)) else [key] for key, part in said.items()]
         said = [name for part in parts for name in part]

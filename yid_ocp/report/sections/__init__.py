@@ -11,6 +11,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from yid_ocp.display import grouped
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.registry import Registry
@@ -74,10 +75,8 @@ def draw_figure_per_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
     """Draw one figure for all `rows` (name, unit, data) of the same unit. Returns pairs (empty title, figure)."""
-    grouped: dict[str, dict[str, _Row]] = {}
-    for name, unit, row in rows:
-        grouped.setdefault(unit, {})[name] = row
-    return [("", draw(own, "" if unit == "1" else unit)) for unit, own in grouped.items()]
+    by_unit = grouped((unit, (name, row)) for name, unit, row in rows)
+    return [("", draw(dict(own), "" if unit == "1" else unit)) for unit, own in by_unit.items()]
 
 
 def rendered_section_dicts(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:

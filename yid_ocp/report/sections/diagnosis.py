@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import effect_entry_label
+from yid_ocp.display import effect_entry_label, grouped
 from yid_ocp.effects.friction import SIGN_SMOOTHING_SPEED
 from yid_ocp.effects.law import TORQUE_LAW_QUANTITY_UNITS, TorqueLawTable
 from yid_ocp.inference.null_test import channels_with_residual_indices
@@ -303,9 +303,7 @@ def _curves(
     best: dict[str, tuple[str, tuple[TimePlotData, TimePlotData]]] = {}
     for _, recording, pair in sorted(found, key=lambda entry: -entry[0]):
         best.setdefault(pair[0].axis_title, (recording, pair))
-    by_recording: dict[str, list[TimePlotData]] = {}
-    for recording, pair in list(best.values())[:_MAX_CHANNELS]:
-        by_recording.setdefault(recording, []).extend(pair)
+    by_recording = grouped((recording, plot) for recording, pair in [*best.values()][:_MAX_CHANNELS] for plot in pair)
     shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
     what, count = "change most with the effects" if changed else "the nominal model predicts worst", len(best)
     drawn = f"Of {count} held-out coordinates or joints, the figures show the {min(count, _MAX_CHANNELS)} that {what}. "
