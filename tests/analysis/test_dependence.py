@@ -41,7 +41,8 @@ def judged(problem):
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = NamedStepEquations.from_equations(step.equations)
-    found = equations_and_sensors_per_parameter(step, symbols, episode, rest.state, problem.theta, rows)
+    at = rest.state, rest.holding_torque, problem.theta, path
+    found = equations_and_sensors_per_parameter(step, symbols, episode, *at)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -112,8 +113,8 @@ def test_without_sensors_only_rows_are_said(hanging):
     step = hanging().step
     symbols, theta = NamedStepEquations.from_equations(step.equations), step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
-    rows = step_equation_jacobians_at_state(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in equations_and_sensors_per_parameter(step, symbols, None, rest.state, theta, rows)}
+    at = rest.state, rest.holding_torque, theta, np.zeros(0)
+    found = {e.parameter: e for e in equations_and_sensors_per_parameter(step, symbols, None, *at)}
     assert found["T1.twist"].observable_rows is None
     assert len(found["T1.bend"].rows) == 12
 

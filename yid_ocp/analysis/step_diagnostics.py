@@ -16,8 +16,8 @@ from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import StepResidualsAndJacobians
+from yid_ocp.integrator.step import Step, compile_step, linearized_rollout_steps, simulate
+from yid_ocp.integrator.step_model import Rollout, StepResidualsAndJacobians, TrackingFeedback
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_function_with_jacobians
@@ -38,12 +38,9 @@ def step_equation_jacobians_at_state(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepResidualsAndJacobians:
     """Compute the step's Jacobians at `state` (nx,), `torque` (nu,) [N m] and prescribed coordinates `path` (nc,)."""
-    n = step.sizes["n"]
-    q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
-    pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
-    return step.kernel.step_residuals_and_jacobians(
-        theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True
-    )
+    one = simulate(step, theta, state, 1, torque[None], np.stack([path, path]))
+    names = step.system.parameters.names
+    return step.kernel.step_residuals_and_jacobians(theta, one.state, one.multipliers, one.torque, names, True)
 
 
 # A row is observed if a reading changes by more than this fraction of the largest change over all rows: smaller changes
@@ -70,15 +67,16 @@ def equations_and_sensors_per_parameter(
     symbols: NamedStepEquations,
     episode: Episode | None,
     state: Array,
+    torque: Array,
     theta: Array,
-    stages: StepResidualsAndJacobians,
+    path: Array,
 ) -> tuple[EquationsAndSensorsOfParameter, ...]:
     """Find for each parameter the step equations that contain it, and the sensors that respond to it.
 
     The equilibrium `state` is disturbed by adding one unit to one equation of one step. The later states follow the
     linear model x_next = (A - B_u K) x, where K is the first gain of the tracking filter. The equation is observed to
-    first order if a reading changes within `_RESPONSE_STEPS` steps. `stages` is the linearisation of the equations
-    `symbols` at `state`. `episode` provides sensors and tracking filter; without it only equations are listed.
+    first order if a reading changes within `_RESPONSE_STEPS` steps. `torque` (nu,) and `path` (nc,) hold the system at
+    `state`. `episode` provides sensors and tracking filter; without it only equations are listed.
     """
     names, parameters, at = symbols.row_names, step.system.parameters, symbols.row_or_column_block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
@@ -88,12 +86,10 @@ def equations_and_sensors_per_parameter(
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
         return tuple(EquationsAndSensorsOfParameter(*entry, None, "", ()) for entry in known)
-    gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
-    if episode.tracking_feedback is not None:
-        gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
     sensors = _sensors(step, episode, state, theta)
+    one = simulate(step, theta, state, 1, torque[None], np.stack([path, path]))
     steps = min(_RESPONSE_STEPS, episode.grid.steps)
-    by_row = _answers(step, stages, gain, sensors, steps)
+    by_row = _answers(step, theta, one, episode.tracking_feedback, sensors, steps)
     strength = np.max(by_row, axis=0, initial=0.0)
     found = []
     for i, entry in enumerate(known):
@@ -130,34 +126,29 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
 
 def _answers(
     step: Step,
-    stages: StepResidualsAndJacobians,
-    gain: Array,
+    theta: Array,
+    one: Rollout,
+    feedback: TrackingFeedback | None,
     sensors: Sequence[_WhitenedSensor],
     steps: int,
 ) -> Array:
-    """Return each sensor's largest whitened response (sensors, rows) to one unit in each row of the first step."""
-    sizes, h = step.sizes, step.time_step
-    n, nz = sizes["n"], sizes["nz"]
-    nt = n + nz + sizes["m"]
-    width = nt + n
-    known = list(step.system.prescribed_coordinate_indices)
-    solved = np.setdiff1d(np.arange(nt), known)
-    new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
-    inverse = np.linalg.inv(new[np.ix_(solved, solved)])
-    identity = np.vstack([np.eye(n), np.zeros((nt - n, n))])
-    old = np.hstack([stages.residual_by_old[0][:, :n], identity, stages.residual_by_old[0][:, n:]])
-    p_old = np.hstack([stages.p1_by_old[0][:, :n], np.zeros((n, n)), stages.p1_by_old[0][:, n:]])
-    old, p_old = old - stages.residual_by_input[0] @ gain, p_old - stages.p1_by_input[0] @ gain
-    x, largest = np.zeros((sizes["nx"], width)), np.zeros((len(sensors), width))
+    """Return each sensor's largest whitened response (sensors, rows) to one unit in each row of the first step.
+
+    `one` is a step from the equilibrium, by which all steps are linearised.
+    """
+    sizes, known = step.sizes, list(step.system.prescribed_coordinate_indices)
+    nt = sizes["n"] + sizes["nz"] + sizes["m"]
+    unit = np.eye(nt + sizes["n"])
+    none = np.zeros((1, sizes["nu"], 0))
+    [(after, forces)] = linearized_rollout_steps(step, theta, one, none, feedback, (unit[:nt], unit[nt:]))
+    x, largest = np.zeros((sizes["nx"], len(unit))), np.zeros((len(sensors), len(unit)))
     for k in range(steps + 1):
-        added = np.eye(width) * (k == 0)
-        y, effort = np.zeros((nt, width)), np.zeros((n, width))
-        y[solved] = -inverse @ (old @ x + added[:nt])[solved]
-        effort[known] = -(new @ y + old @ x + added[:nt])[known] / h
+        moved, effort = np.vstack([x, unit * (k == 0)]), np.zeros((sizes["n"], len(unit)))
+        effort[known] = forces[0, : len(known)] @ moved
         for i, sensor in enumerate(sensors):
             read = sensor.by_state @ x + sensor.by_effort @ effort
             largest[i] = np.maximum(largest[i], np.max(np.abs(read), axis=0, initial=0.0))
-        x = np.vstack([y[:n], p_new @ y + p_old @ x + added[nt:], y[n : n + nz]])
+        x = after[0] @ moved
     return largest
 
 

@@ -278,10 +278,11 @@ static mask factorise(Work *k, mask wanted, mask at_work) {
     return good;
 }
 
-static void solve(Work *k, const real *b, real *x) {
+/* Newton's correction x = -A^-1 r of the residual that was evaluated last. */
+static void correction(Work *k, real *x) {
     const Factors *f = &k->factors;
     real *y = k->y;
-    for (int a = 0; a < NY; a++) y[a] = b[order[a]];
+    for (int a = 0; a < NY; a++) y[a] = -k->r[order[a]];
     for (int p = 0; p < NY; p++) {
         const real value = y[p];
         for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
@@ -385,8 +386,7 @@ static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mas
             fresh |= wanted;
             refactor &= NOT(wanted);
         }
-        for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
-        solve(k, k->r, k->delta);
+        correction(k, k->delta);
         const real norm = coordinate_norm(k->delta), rate = norm / previous;
         *error = choose(left, norm, *error);
         left &= is_finite(norm);
@@ -425,9 +425,8 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, i
         if (!evaluate(k, a)) return NOT_FINITE;
         linearise(k, a, 0);
         if (!factorise(k, EVERY, EVERY)) return SINGULAR;
-        for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
-        solve(k, k->r, step);
-        const double norm = *error = coordinate_norm(step), work = -work_along(k, step);
+        correction(k, step);
+        const double norm = *error = coordinate_norm(step), work = work_along(k, step);
         const int is_near = norm < 1e3 * tolerance;
         if (!isfinite(norm)) return NOT_FINITE;
         if (norm <= tolerance || (is_near && norm > 0.5 * previous)) {
@@ -451,8 +450,7 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, i
                 left = work_along(k, step) / work;
                 if (fabs(left) <= 0.5 || (left > 0 && part == 1.0)) break;
             } else if (!by_work) {
-                for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
-                solve(k, k->r, trial);
+                correction(k, trial);
                 const double size = coordinate_norm(trial);
                 if (isfinite(size) && size <= (1.0 - 0.25 * longest * part) * norm) break;
             }

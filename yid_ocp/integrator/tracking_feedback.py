@@ -62,9 +62,7 @@ def lqr_tracking_feedback(
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arm_step = compile_driven_arms_only_step(step) if arms is None else arms
-    values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
-    parameters = arm_step.system.parameters
-    arm_theta = parameters.vector({name: values[name] for name in parameters.names})
+    arm_theta = np.asarray(theta, float)[list(map(system.parameters.index, arm_step.system.parameters.names))]
     nu = len(system.driven)
     # p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, (N + 1, nu), which starts from rest
     angles, pushes = np.vstack([reference[:1], reference]), np.vstack([torques[:1], torques])
@@ -74,14 +72,13 @@ def lqr_tracking_feedback(
 
     weight_q, weight_u = (np.eye(nu) * (1.0 / std**2) for std in (_ANGLE_STD, _TORQUE_STD))
     gain = np.zeros((steps, nu, 2 * nu))
-    cost: Array | None = None
     states = np.hstack([reference, momenta])[:-1]
     by_state, by_torque = _one_step_each(arm_step, states, torques, reference[1:], arm_theta)
     rate, stages = by_state[:, :nu, nu:] / step.time_step, np.zeros((steps, 2 * nu, 2 * nu))
     stages[:, :nu, :nu], stages[:, nu:, nu:] = weight_q, rate.transpose(0, 2, 1) @ rate / _RATE_STD**2
+    cost = stages[-1]
     for k in reversed(range(steps)):
         a, b, stage = by_state[k], by_torque[k], stages[k]
-        cost = stage if cost is None else cost
         pushed = b.T @ cost
         _, gain[k], failed = scipy.linalg.lapack.dposv(weight_u + pushed @ b, pushed @ a)
         gain[k] = np.nan if failed else gain[k]

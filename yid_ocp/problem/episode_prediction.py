@@ -293,11 +293,9 @@ class EpisodePredictor:
                 by_applied += directions.torque_tangents
             if feedback is not None:
                 by_applied -= feedback.gain @ rollout.state_sensitivity[:-1, feedback.state_indices]
-        predicted, sensitivities, read = [], [], self._recorded(episode, rollout, theta, wanted)
-        for samples in episode.measurements:
-            values, by_all = self._predict(samples, read, by_applied, theta, wanted)
-            predicted.append(values)
-            sensitivities.append(by_all)
+        read = self._recorded(episode, rollout, theta, wanted)
+        found = [self._predict(samples, read, by_applied, theta, wanted) for samples in episode.measurements]
+        predicted, sensitivities = (tuple(own[k] for own in found) for k in range(2))
         correction = by_correction = None
         if episode.input_errors is not None and episode.input_errors.has_encoder_measurements and feedback is not None:
             correction = rollout.torque - inputs.torque
@@ -308,7 +306,7 @@ class EpisodePredictor:
         # the derivatives of the states are the largest arrays, and samples no longer need them
         rollout = replace(rollout, state_sensitivity=None, multipliers_sensitivity=None, effort_sensitivity=None)
         guess = None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates]
-        said = (rollout, start.equilibrium, tuple(predicted), tuple(sensitivities) if prepared.derivatives else None)
+        said = (rollout, start.equilibrium, predicted, sensitivities if prepared.derivatives else None)
         return EpisodePrediction(*said, guess, correction, by_correction)
 
     def readings_and_sensitivities(

@@ -73,7 +73,7 @@ def _run_inspect(
         draw_sparsity_patterns(picture, [[patterns[name] for name in row] for row in _PATTERN_LAYOUT])
         write_text(folder.path / "equations.txt", "\n".join(symbols.text_lines()) + "\n")
         files = () if export is None else export_step_functions(symbols, Path(export), point.theta, step.time_step)
-        dependences = _dependence(step, symbols, problem, point, rows)
+        dependences = _dependence(step, symbols, problem, point)
         driven, prescribed = step.system.driven, step.system.prescribed
         roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")
         at = _columns_at(step, point) if chosen else np.zeros(0)
@@ -173,15 +173,12 @@ def _patterns(
 
 
 def _dependence(
-    step: Step,
-    symbols: NamedStepEquations,
-    problem: EstimationProblem | None,
-    point: _LinearisationPoint,
-    rows: StepResidualsAndJacobians,
+    step: Step, symbols: NamedStepEquations, problem: EstimationProblem | None, point: _LinearisationPoint
 ) -> tuple[step_diagnostics.EquationsAndSensorsOfParameter, ...]:
     """Return the equations and sensors that depend on each parameter; for free ones also over whole recordings."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.equations_and_sensors_per_parameter(step, symbols, episode, point.state, point.theta, rows)
+    at = point.state, point.torque, point.theta, point.prescribed_positions
+    found = step_diagnostics.equations_and_sensors_per_parameter(step, symbols, episode, *at)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
