@@ -12,7 +12,7 @@ import pytest
 import yid_ocp as yid
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import EffectSettings, config_yaml_with_defaults
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
@@ -220,7 +220,7 @@ def test_a_problem_has_the_options_of_its_section(written):
     wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {initial_state_fit_parameters: [T1.mas]}\n"))
     for key, hint in (("T*.bent", "did you mean 'T*.bend'?"), ("x.servo_gain", "set model.arms.mode: servo, which")):
         with pytest.raises(ConfigError, match="there is no parameter") as caught:
-            build_system(settings(f"parameters={{'{key}': {{free: true}}}}"))
+            build_system(replace(wrong, parameters={key: ParameterSettings(free=True)}))
         assert caught.value.hint.startswith(hint)
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
         make_problem_options(wrong, build_system(wrong))
