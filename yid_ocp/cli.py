@@ -516,6 +516,10 @@ def _failed(error: Exception, as_json: bool) -> int:
         what, hint = f"there is not enough memory: {error}", "use shorter recordings, fewer links or --workers 1"
         allowed = "a run that fits into the free memory"
         return _wrong(InsufficientMemoryError(what, where="this machine", allowed=allowed, hint=hint), as_json)
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "yid_ocp").startswith("yid_ocp"):
+        what, allowed = f"the Python package {error.name} cannot be imported", "an environment with all dependencies"
+        hint, where = "pip install . in the project's clone", f"the Python environment {sys.prefix}"
+        return _wrong(ConfigError(what, where=where, allowed=allowed, hint=hint), as_json)
     # any other exception is a bug of this package
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)

@@ -310,3 +310,13 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
 def test_odd_yaml_is_refused_at_once(written, text, said):
     with pytest.raises(ConfigError, match=said):
         load_config(written(text))
+
+
+@pytest.mark.parametrize("folder", ["arm-check-20261130-083851", "arm-20261130-083851-2", "arm"])
+def test_the_settings_of_a_run_folder_have_the_name_of_its_model(folder, tmp_path):
+    (tmp_path / folder).mkdir()
+    file = tmp_path / folder / "config.yaml"
+    file.write_text("{}\n")
+    assert load_config(file).name == "config"
+    (tmp_path / folder / "result.json").write_text("{}\n")
+    assert load_config(file).name == "arm"

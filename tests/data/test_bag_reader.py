@@ -191,6 +191,23 @@ def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp
     assert np.array_equal(joints.values_by_channel["position_command"][:, 0], wanted)
 
 
+def test_a_topic_called_command_is_no_measurement(tmp_path: Path) -> None:
+    stamps = [START + k * SECOND // 100 for k in range(4)]
+    messages = [("/joint_commands", t, joint_state(("a",), t, position=[5.0])) for t in stamps]
+    messages += [("/joint_states", t, joint_state(("a",), t, position=[float(k)])) for k, t in enumerate(stamps)]
+    path = write_bag(tmp_path, "mcap", messages)
+    contents = preview_file(path)
+    assert [source.imported_as for source in contents.sources] == ["commands a", "joints a"]
+    assert contents.reader_options["command_topic"] == "/joint_commands"
+    for options in ({}, contents.reader_options):
+        joints = joints_of(read_any(path, **options))
+        assert np.array_equal(joints.position[:, 0], np.arange(4))
+        assert np.array_equal(joints.values_by_channel["position_command"][:, 0], [5.0] * 4)
+    assert joints_of(read_any(path, joint_topics=["/joint_commands"])).position[0, 0] == 5.0
+    path.write_bytes(path.read_bytes().replace(b"\x04\0\0\0ros2", b"\x04\0\0\0none", 1))
+    refused(path, "does not have the profile ros2")
+
+
 def twelve_topics() -> Messages:
     """Two arms, a point, a pose and a transform's frame, and seven topics that say nothing of joints or points."""
     messages = list(two_arms())

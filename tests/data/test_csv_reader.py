@@ -127,7 +127,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "not known: label", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "not known: q_", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
-    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "the recording has no measurements", ""),
+    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "has no measurements", "import FILE"),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning of times": (GOOD, {"column_meanings": {"t": "time"}}, "meaning 'time' of column", "'t=t'"),
@@ -251,6 +251,13 @@ def test_the_preview_of_a_table(text: str, columns: dict[str, str], tmp_path: Pa
     contents = preview_file(table(tmp_path, text))
     assert contents.reader_options["column_meanings"] == columns
     assert ("has_header" in contents.reader_options) == text.startswith("0")
+
+
+def test_the_rates_of_a_preview_are_those_of_the_import(tmp_path: Path) -> None:
+    rows = "".join(f"{5 * k},0.1,{',,' if k % 3 else '1,1,1'}\n" for k in range(31))
+    contents = preview_file(table(tmp_path, f"t_ms,q_a,x,y,z\n{rows}"))
+    assert [source.mean_rate for source in contents.sources] == pytest.approx([200, 200, *[200 / 3] * 3])
+    assert {source.kind for source in contents.sources} == {"numbers"}
 
 
 def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:

@@ -183,7 +183,10 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
         run_blind([driven], folder, 2, 3, workers=InlineExecutor())
 
 
-def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, printed, monkeypatch):
+def test_what_cannot_be_proved_is_refused(driven, pendulum, repository, tmp_path, printed, monkeypatch):
+    springs = load_config(repository / "configs" / "springs_series_joint.yaml")
+    with pytest.raises(ConfigError, match=r"cannot simulate 'points_camera'(.|\n)*springs_series_joint.yaml, line"):
+        run_blind([springs], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     prescribed = load_config(pendulum)
     with pytest.raises(ConfigError, match=r"joints are all driven(.|\n)*model.arms.mode"):
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())

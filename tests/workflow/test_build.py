@@ -12,7 +12,7 @@ import pytest
 import yid_ocp as yid
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import EffectSettings, config_yaml_with_defaults
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis.hypotheses import make_candidate_effects
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
@@ -218,6 +218,10 @@ def test_a_problem_has_the_options_of_its_section(written):
     assert options.prior_stds == {"T1.bend": 2.0}
     assert options.sensors["points"].std == 0.1
     wrong = load_config(written("model: {object: {kind: foam_y}}\nproblem: {initial_state_fit_parameters: [T1.mas]}\n"))
+    for key, hint in (("T*.bent", "did you mean 'T*.bend'?"), ("x.servo_gain", "set model.arms.mode: servo, which")):
+        with pytest.raises(ConfigError, match="there is no parameter") as caught:
+            build_system(replace(wrong, parameters={key: ParameterSettings(free=True)}))
+        assert caught.value.hint.startswith(hint)
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
         make_problem_options(wrong, build_system(wrong))
     assert "line 2: problem.initial_state_fit_parameters" in caught.value.where
@@ -295,8 +299,8 @@ def test_joints_driven_by_torques_have_sharp_friction_and_candidates_are_as_shar
     candidates = make_candidate_effects(build_system(run), [], ["joint_stribeck"])
     stated = EffectSettings(kind="joint_stribeck", location=candidates[0].location, values={"tau_s": 0.1})
     known = build_system(replace(run, model=replace(run.model, effects=(*run.model.effects, stated)))).effects
-    with pytest.raises(ConfigError, match="already has the effect joint_coulomb at every"):
-        make_candidate_effects(build_system(run), [], ["joint_coulomb"])
+    with pytest.raises(ConfigError, match=f"already has the effect joint_coulomb, {known[0].label}\n"):
+        make_candidate_effects(build_system(run), [], ["joint_coulomb", "joint_stribeck", known[0].label])
     dry = [own for own in (*known, *candidates) if own.kind in ("joint_coulomb", "joint_stribeck")]
     assert {effect.sign_smoothing_speed for effect in dry} == {3e-3 if v_s == "3e-3" else 0.02 if file else 1e-3}
 

@@ -148,7 +148,7 @@ def test_the_baselines_effects_stay_in_the_model(run):
         ({"format": "yid-plan/1"}, "another command"),
         ({"status": "failed", "message": "no"}, "the run in this folder failed: no"),
         ({"covariance": {}}, "the key .names. is missing"),
-        ({"covariance": {"names": [], "matrix": []}}, "the run determines no parameter that can be compared"),
+        ({"covariance": {"names": [], "matrix": []}}, "determines no parameter to compare"),
     ],
 )
 def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, words):

@@ -37,6 +37,9 @@ _ALIAS_COST = 40  # of an alias in entries, because merging one compares its map
 _ALLOWED_YAML = "lines KEY: VALUE, those of a section with the same indentation; numbers, text, true, false or [lists]"
 _FACTORS = {("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("min", "s"): 60.0, ("mm", "m"): 1e-3, ("cm", "m"): 1e-2}
 _FACTORS |= {("deg", "rad"): math.pi / 180, ("g", "kg"): 1e-3, ("kHz", "Hz"): 1e3, ("mN m", "N m"): 1e-3}
+_RUN_FOLDER_ENDING = re.compile(
+    r"(-(check|compare|diagnose|friction|identifiability|inspect|plan|report|simulate|track))?-\d{8}-\d{6}(-\d+)?$"
+)
 _YAML_FAULTS = {  # what the parser says: in plain words, and the cure
     "expected <block end>": ("its indentation differs from that of the lines above", "indent it like its section"),
     "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
@@ -61,7 +64,10 @@ def load_config(
     for override in overrides:
         _override(data, places, override)
     run = _Reader(places, origin, Path.cwd() if path is None else file.resolve().parent).build(RunSettings, data, ())
-    return dataclasses.replace(run, name=file.stem, config_file=str(file), key_locations=places)
+    name = file.stem
+    if file.name == "config.yaml" and (file.parent / "result.json").is_file():  # of a run folder NAME-COMMAND-DATE
+        name = _RUN_FOLDER_ENDING.sub("", file.resolve().parent.name)
+    return dataclasses.replace(run, name=name, config_file=str(file), key_locations=places)
 
 
 def _read(path: Path) -> str:

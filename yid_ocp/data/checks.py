@@ -172,8 +172,8 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         late, over = begin - first, end - last
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
-            how = f"starts {abs(late):.3g} s and ends {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
-            what = f"{group.name} {how} than the joints ({slack:.3g} s is tolerated at one of the two ends)"
+            how = f"start {abs(late):.3g} s and end {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
+            what = f"the times of {group.name} {how} than those of the joints ({slack:.3g} s is tolerated at one end)"
             advice = "if the clocks differ, import again with --clock-offset FILE=SECONDS (added to the times). "
             advice += "If not, cut out the common time (Python: Recording.time_slice)"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
@@ -286,7 +286,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         least = max(QUALITY_LIMITS.min_point_travel, 6 * float(np.median(known)) if len(known) else 0.0)
         moved.append((size / least, f"{group.name} moves by at most {size:.2g} m (at least {least:.2g} m is needed)"))
     if moved and max(moved)[0] < 1.0:
-        advice = "record a motion. At rest, only weights and stiffnesses can be found"
+        advice = "record a motion. For weights and stiffnesses alone, several postures at rest are enough"
         what = " and ".join(words for _, words in moved)
         yield Issue("standstill", what, "warning", 1 / max(max(moved)[0], 1e-3), advice, "")
 

@@ -107,10 +107,12 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     best = _motion_lag(first, other, begin - start)
     if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"
-        what = f"the recording times of {first.name} and {other.name} do not overlap, and no common motion aligns them"
+        what = f"the recording times of {first.name} and {other.name} do not overlap, and no motion clearly aligns them"
         hint = f"shift its times: --clock-offset {other.name}={begin - start:.4f}, if both began together"
-        hint += f", or {other.name}={begin - start - best.lag:.4f}, the likeliest by the motion" if best else ""
-        raise DataError(what, where=spans, allowed="recording times that overlap, or a motion in both", hint=hint)
+        guess = f" (the motion hints at {begin - start - best.lag:.4f}, which is uncertain)" if best else ""
+        hint += f"; otherwise measure the offset{guess}"
+        allowed = "recording times that overlap, or a clear common motion"
+        raise DataError(what, where=spans, allowed=allowed, hint=hint)
     why = "because the recording times do not overlap. With this shift, the points follow the joint angles best "
     why += f"({best.explained:.1%} of the motion). A fit of the model corrects the rest (± {_ALIGNED_CLOCK_STD:g} s)"
     return begin - start - best.lag, why

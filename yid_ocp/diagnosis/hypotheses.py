@@ -60,19 +60,19 @@ def make_candidate_effects(
     if isinstance(choice, str) or not choice:
         what, hint = f"the candidates are {choice!r}, but must be 'all' or a list", f"leave {where} out to try all"
         raise ConfigError(what, where=where, allowed="all, or a list of kinds such as [joint_coulomb]", hint=hint)
+    kinds, own = {kind for kind, _ in possible}, {effect.kind for effect in system.effects}
+    if held := [text for text in choice if text in present or text in own - kinds]:
+        allowed = ", ".join(dict.fromkeys(kind for kind, _ in possible))
+        what, hint = f"the model already has the effect {', '.join(held)}", f"remove {', '.join(held)} from this list"
+        raise ConfigError(what, where=where, allowed=allowed, hint=hint)
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
-        if text in present:
-            what, allowed = f"the candidate {text} is already in the model", "effects that the model does not have"
-            raise ConfigError(what, where=where, allowed=allowed, hint=f"remove {text} from this list")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
             missing = ", ".join(sorted(cls.required_sensors - sensors))
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
-            if any(effect.kind == kind for effect in system.effects):
-                what = f"the model already has the effect {kind} at every possible location"
             allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), f"remove {kind} from this list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)
         pairs += [pair for pair in found if pair not in pairs]

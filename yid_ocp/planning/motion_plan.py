@@ -128,6 +128,8 @@ def moved_point_and_boxed_frames(
     """Return evaluators of the moved point and of the frames in a box. Raises `ConfigError` for unknown frames."""
     if options.point is None:
         what, hint = "plan.point is missing, the point that moves to the target", "add --set plan.point=NAME"
+        if options.target_position is None and options.point_target_offset_from_start is None:
+            hint += " and its target, --set 'plan.target_position=[X, Y, Z]' (world, m)"
         allowed = ", ".join(system.point_frames or system.mechanism.frames)
         raise ConfigError(what, where="plan.point", allowed=allowed, hint=hint)
     calm = [name for name in system.point_frames if name != options.point]

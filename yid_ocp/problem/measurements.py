@@ -60,7 +60,8 @@ def rollout_time_grid(recording: Recording, time_step: float, duration: float | 
         raise DataError(what, where=f"problem.time_step, recording '{recording.name}'", allowed=allowed, hint=hint)
     if steps < 2:
         what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
-        hint = f"set problem.time_step: {span / 3:.2g}, or record longer" if span > 0 else "record longer"
+        longer = "set a longer problem.duration" if span < t[-1] - t[0] else "record longer"
+        hint = f"{longer}, or set problem.time_step: {span / 3:.2g}" if 0 < span == t[-1] - t[0] else longer
         allowed = f"at least {2 * time_step:g} s of data"
         raise DataError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     return TimeGrid(float(t[0]), time_step, steps)

@@ -34,6 +34,7 @@ from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_ta
 from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualArmImperfections
+from yid_ocp.virtual.mjcf import import_mujoco
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
 from yid_ocp.workflow.blind_slices import rescore_blind, score_joined_slices, score_whole_ensemble, write_slice_results
 from yid_ocp.workflow.build import build_system
@@ -100,6 +101,7 @@ def run_blind(
         if number < least:
             what, allowed = f"the {what} is {number}, but must be at least {least}", f"a whole number from {least}"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"leave {where} out, or give a larger number")
+    import_mujoco()
     runs = list(map(_with_simulated_noise, runs))
     names = [entry.name for entry in runs]
     for i, name in enumerate(names):
@@ -435,7 +437,14 @@ def _ensemble(experiment: _BlindExperiment, first: Path, written: int) -> tuple[
 
 def _with_simulated_noise(run: RunSettings) -> RunSettings:
     """Return the settings without stated noise, which simulated recordings do not have. Raises `ConfigError`."""
-    system = build_system(run)
+    first, system = read_recordings_of_role(run, count=1), build_system(run)
+    has_pose = any(group.camera_pose is not None for recording in first for group in recording.points)
+    simulated = ("points_arm", "points_camera")[: 1 + has_pose] if system.point_frames else ()
+    for name in run.sensors if first else ():
+        if name.startswith("points") and name not in simulated:
+            what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
+            hint = "use a configuration with model.object, and a recording with the pose of its camera"
+            raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, servo", hint=hint)

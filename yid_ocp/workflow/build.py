@@ -65,8 +65,13 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         return _completed(run, _clamped_system(run, cable))
     robot = None
     if model.robot is not None:
-        with add_setting_location_to_errors(run, "model", "arms", "joints"):
+        try:
             robot = read_urdf(model.robot, **urdf_reader_arguments(run))
+        except YidError as error:
+            with add_setting_location_to_errors(run, "model", "robot"):
+                read_urdf(model.robot)  # an error of the file itself
+            with add_setting_location_to_errors(run, "model", "arms", "joints"):
+                raise error
     joints = () if robot is None else robot.joint_names
     damping, of_object = _dampings(run, joints)
     item = model.object
@@ -278,7 +283,13 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
-            raise unknown_name_error(run, "parameter", key, parameters.names, "parameters", key)
+            split = [name.rpartition(".") for name in parameters.names]
+            owner = key.rpartition(".")[0]  # for a pattern such as T*.bend, patterns are proposed
+            alike = dict.fromkeys(f"{owner}.{end}" for own, _, end in split if "*" in owner and _matches(own, owner))
+            error = unknown_name_error(run, "parameter", key, alike or parameters.names, "parameters", key)
+            if ".servo_" in key and run.model.arms.mode != "servo":
+                error.hint = f"set model.arms.mode: servo, which has this parameter, or delete parameters.{key}"
+            raise error
         said = {name: value for name, value in vars(given).items() if value is not None}
         result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
     # a fixed parameter has the published value without a prior

@@ -144,9 +144,13 @@ def build_problem(
         _refuse_object_mounted_on_driven_arm(run, system)
     free = free_parameter_names(run, system.parameters)
     if not free:
-        names = sorted(system.parameters.names, key=lambda name: (name not in run.parameters, name.endswith(".mass")))
+        named = build.settings_by_parameter_name(run, system.parameters)
+        names = sorted(
+            system.parameters.names, key=lambda name: (name not in named, name.endswith((".damping", ".mass")))
+        )
         allowed = ", ".join(names[:8]) + f" and {len(names) - 8} more" * (len(names) > 8)
-        what, hint = "no parameter is free, so there is nothing to estimate", f"set parameters.{names[0]}.free: true"
+        what = "no parameter is free, so there is nothing to estimate"
+        hint = f"free those to estimate, for example parameters.{names[0]}.free: true"
         raise run.config_error(what, "parameters", allowed=f"one free parameter or more, among {allowed}", hint=hint)
     if same := sorted(set(run.recordings.estimate) & set(run.recordings.held_out)):
         what, hint = f"{same[0]} is listed for estimation and as held out", "remove it from one of the two lists"

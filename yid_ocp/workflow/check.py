@@ -114,12 +114,13 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": share * float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
-    groups = {}
-    for own in recording.all_groups:
+    groups, span = {}, problem.options.duration
+    used = recording if span is None else recording.time_slice(-math.inf, episode.grid.start_time + span)
+    for own in used.all_groups:
         period, gap = median_sample_period(own.t), float(np.max(np.diff(own.t), initial=0.0))
         counts = {"samples": len(own.t), "names": list(own.names)}
         groups[own.name] = counts | {"rate": 1.0 / period if period else 0.0, "longest_gap": gap}
-    entry: dict[str, Any] = {"recording": episode.name, "role": role, "duration": recording.duration}
+    entry: dict[str, Any] = {"recording": episode.name, "role": role, "duration": used.duration}
     entry |= {"steps": episode.grid.steps, "groups": groups, "noise": noise, "noise_fraction": share}
     rate = 1.0 / problem.step.time_step
     if arm is not None:

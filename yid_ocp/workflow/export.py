@@ -18,7 +18,7 @@ from yid_ocp.config.settings import ParameterSettings, RunSettings, config_yaml_
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, grouped
 from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FeatureExportSupport
@@ -230,7 +230,9 @@ def _refuse_losses(
     lost += [name for name in absent if name.rpartition(".")[0] not in effects]
     lost += [f"grasp {name}" for name, entry in grasps.items() if entry.loses_motion_or_force]
     if lost and not is_lossy:
-        what, where = f"{form.upper()} cannot represent these parts of the model: {', '.join(lost)}", f"--format {form}"
+        parts = grouped((name.partition("@")[0] if "@" in name else name.rpartition(".")[2], name) for name in lost)
+        told = ", ".join(own[0] if len(own) == 1 else f"{kind} ({len(own)} times)" for kind, own in parts.items())
+        what, where = f"{form.upper()} cannot represent these parts of the model: {told}", f"--format {form}"
         other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
         hint = f"{other}add --lossy to leave them out, with a manifest that has the reason for each"
         raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)

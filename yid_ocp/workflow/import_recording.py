@@ -113,9 +113,11 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     try:
         recording = _read(files, options, progress)
     except DataError as error:
-        unknown = next((key for key, own in (options.get("column_meanings") or {}).items() if own == "skip"), "")
+        columns = options.get("column_meanings") or {}
+        unknown = next((key for key, own in columns.items() if own == "skip"), "")
+        given = ",".join(f"{key}={own}" for key, own in {**columns, unknown: "position:JOINT"}.items())
         has_hint = not unknown or "--columns" in error.hint
-        hint = error.hint if has_hint else f"give columns a meaning, as in --columns '{unknown}=position:JOINT'"
+        hint = error.hint if has_hint else f"give columns a meaning, as in --columns '{given}'"
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"

@@ -65,7 +65,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, out.with_suffix(".html"), *written):
         if file.exists() and not arguments.replace:
-            hint = "add --replace to overwrite it, or choose an --out in another folder"
+            hint = "add --replace to overwrite it, or choose another --out"
             allowed = "files that do not exist yet, or --replace"
             hint = f"to use it again, give {file} as the recording; or {hint}" if file in written else hint
             what = f"{file.name} already exists, and `init` would write it"

@@ -291,7 +291,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, or an unknown user's home
         raise folder_error(error, Path(str(out)[:200]), "this path cannot be a run folder") from error
     for found, what, hint in (
-        (filled, "exists and is not empty", "choose another name with --out, or leave it out for a numbered one"),
+        (filled, "exists and is not empty", "choose another name with --out, or leave it out for one with the date"),
         (is_link, "is a symbolic link", "give the folder that the link points to, or choose another --out"),
         (is_existing_file, "is an existing file", f"choose another --out, or rename {target.name}"),
     ):

@@ -73,7 +73,7 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         what, allowed = f"the result is damaged, or of another version: {fault}", f"a result of {package_version()}"
         raise DataError(what, where=str(file), allowed=allowed, hint=again) from error
     if not names:
-        what, allowed = "the run determines no parameter that can be compared", "runs that determine a free parameter"
+        what, allowed = f"the run {folder} determines no parameter to compare", "runs that determine a free parameter"
         hint = f"leave this run out; `yid-ocp identifiability {folder}/config.yaml --what-if` ranks better experiments"
         raise DataError(what, where=str(file), allowed=allowed, hint=hint)
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):

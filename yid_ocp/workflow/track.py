@@ -26,7 +26,7 @@ from yid_ocp.vision import surface_meshes, track_result
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
-from yid_ocp.vision.frames import FrameSequence, look_at_pose
+from yid_ocp.vision.frames import FrameSequence, import_open3d, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceEstimates, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTruth
@@ -51,6 +51,7 @@ def _run_track(
 ) -> CommandOutcome[None]:
     """Track the frames of `track.frames_path` or of a virtual camera. Results of an interrupted run are reused."""
     settings = run.track
+    import_open3d()
     with atomic_run_folder(run, out, "track") as folder:
         folder.record_run_start(run, "track")
         system = build_system(run)

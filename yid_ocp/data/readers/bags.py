@@ -103,6 +103,9 @@ class OpenBag:
                 hint = f"name tables one by one; if the folder is a bag, {hint}"
             elif self.path.is_file() and not self.path.stat().st_size:
                 what, hint = "the bag cannot be read, because it is empty (0 bytes)", "copy it again from the recorder"
+            elif "Profile is not ros2" in str(error):  # as rosbags says it
+                what = "the messages cannot be decoded, because the header of the file does not have the profile ros2"
+                hint = "if they are of ROS 2, write the file with the profile 'ros2'; otherwise export them as CSV"
             allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
             raise DataError(what, where=str(self.path), allowed=allowed, hint=hint) from error
 
@@ -144,6 +147,8 @@ class _Contents:
     places: Sequence[BagMessage]
     mounted: Sequence[BagMessage]  # readings of wrist sensors and IMUs
     topic_of_fields: str  # topic of the fields that the user named; empty without any
+    joints_by_default_topic: Mapping[str, set[str]]
+    command_topic: str | None  # the default topic that has commands, as its name says
 
 
 @dataclass(frozen=True)
@@ -230,19 +235,18 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     bag = _contents(path, None, progress)
     names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
-    states, owners = _default_joint_topics(bag.file), dict[str, set[str]]()
-    for message in (message for message in bag.states if message.source in states):
-        for joint in message.content.name:
-            owners.setdefault(joint, set()).add(message.source)
-    if shared := {topic for topics in owners.values() if len(topics) > 1 for topic in topics}:
+    joints, command = bag.joints_by_default_topic, bag.command_topic
+    states = [topic for topic in sorted(joints) if topic != command]
+    if shared := {one for one in states for other in states if one != other and joints[one] & joints[other]}:
         options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
-        notes.append(f"{', '.join(sorted(shared))} have joints in common. Choose one of these topics by --joint-topic")
+        notes.append(f"{', '.join(sorted(shared))} have joints in common. Choose the measured one by --joint-topic")
     elif len(states) > 1:
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if message.source in names):
         notes.append("poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
     units, why = base.guess_non_si_units(_for_guess(bag, names))
-    options |= {key: found for key, found in (("point_names", names), ("units", units)) if found}
+    told = (("command_topic", command), ("point_names", names), ("units", units))
+    options |= {key: found for key, found in told if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 
@@ -276,7 +280,9 @@ def _contents(
             for source, part, kind in _parts_of_message(connection.topic, content, connection.msgtype):
                 if connection.msgtype not in _TREES or trees is None or source in trees:
                     lists.get(kind, places).append(BagMessage(source, int(logged), _stamp(part), _plain(part, kind)))
-    return _Contents(bag, states, places, mounted, own_topic)
+    usual = _default_joint_topics(bag)
+    joints, command = base.joints_and_command_topic((m.source, m.content.name) for m in states if m.source in usual)
+    return _Contents(bag, states, places, mounted, own_topic, joints, command)
 
 
 def _parts_of_message(topic: str, content: Any, kind: str) -> Iterator[tuple[str, Any, str]]:
@@ -387,14 +393,16 @@ class _States(NamedTuple):
 
 
 def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
-    topics, command = options.joint_topics, options.command_topic
+    topics, command, notes = options.joint_topics, options.command_topic, list[str]()
+    if topics is None and command is None and not bag.topic_of_fields and (command := bag.command_topic):
+        notes.append(f"{command} has commands, as its name says. If they are measured, add --joint-topic {command}")
     default = [bag.topic_of_fields] if bag.topic_of_fields else _default_joint_topics(bag.file)
     known = list(dict.fromkeys([*bag.file.topic_names_of_types(*_JOINT_TYPES), *default]))
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_one_of(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else base.parse_old_to_new_joint_names(options.joints, where)
-    found, notes = [], []
+    found = []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)
     for topic in chosen:
@@ -449,7 +457,7 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    together, notes = base.joints_on_fastest_clock(made, where, f"choose topics: --joint-topic {groups[0].topic},...")
+    together, notes = base.joints_on_fastest_clock(made, where, "choose what is measured: --joint-topic TOPIC,TOPIC")
     for entry in (entry for entry in groups if entry.command):
         group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
         # each command is held until the next; before the first command, the first one is used
@@ -565,7 +573,8 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
         note = f"joints, left out because the bag has joint states. To use them, add --joint-topic {topic.name}"
     elif topic.kind in _JOINT_TYPES:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
-        becomes, note = f"joints {', '.join(joints)}", ""
+        kind = "commands" if topic.name == bag.command_topic else "joints"
+        becomes, note = f"{kind} {', '.join(joints)}", ""
     elif points := [name for source, name in names.items() if source.partition(":")[0] == topic.name]:
         becomes, note = f"point {', '.join(points)}", f"in {frames}" if frames else ""
     elif topic.kind == _POSE_ARRAY:

@@ -274,6 +274,16 @@ def joints_on_fastest_clock(
     return replace(clock, names=names, t=t, **channels), tuple(notes)
 
 
+def joints_and_command_topic(states: Iterable[tuple[str, Sequence[str]]]) -> tuple[dict[str, set[str]], str | None]:
+    """Return the joints of each topic, and the topic with "command" in its name, if others have the same joints."""
+    joints: dict[str, set[str]] = {}
+    for topic, names in states:
+        joints.setdefault(topic, set()).update(names)
+    called = [topic for topic in joints if "command" in topic.lower()]
+    others = set[str]().union(*(names for topic, names in joints.items() if topic not in called))
+    return joints, called[0] if len(called) == 1 and joints[called[0]] == others else None
+
+
 def _can_interpolate(known: Array, t: Array) -> BoolArray:
     """Mask of the times `t` that are in `known` or lie between two times of `known` that are near enough together."""
     after, before = np.searchsorted(known, t), np.searchsorted(known, t, side="right") - 1

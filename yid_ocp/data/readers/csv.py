@@ -189,10 +189,11 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     if head and not numbers:  # every row has more or fewer cells: the error of reading the first one
         _numbers(head[1], names, [None] * len(names), f"{path}, line {head[0]}")
     table = np.array(numbers).reshape(-1, len(names))
-    numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
+    is_blank = np.array(blank, bool).reshape(table.shape)  # a sensor that has no sample in this row
+    numeric = np.isfinite(table).sum(axis=0) > _MOST_BAD * (~is_blank).sum(axis=0)
     hint = "set the character between its columns, such as --delimiter ';' (--preview shows the columns)"
     raise_data_error_unless(numeric.any(), "the table has no column of numbers", str(path), _ALLOWED, hint)
-    text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
+    text = ~np.isfinite(table) & ~is_blank
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
@@ -208,12 +209,6 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         options["column_meanings"] = unknown
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
-    sources = []
-    for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
-        kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out, its meaning is unknown"
-        rate = mean_sample_rate(t) if ok else math.nan
-        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are not rows of numbers. --skip-bad-lines leaves them out"] if bad else []
     clean = table[np.isfinite(t)]
     try:
@@ -224,6 +219,12 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     guessed = [own for own in zip(units.items(), why, strict=True) if own[0][0] not in dict(stated)]
     if guessed:
         options["units"] = dict(own for own, _ in guessed)
+    sources, second = [], base.factor_to_si_by_quantity({**units, **dict(stated)}, str(path))["t"]
+    for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
+        kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
+        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out, its meaning is unknown"
+        rate = mean_sample_rate(second * t[np.isfinite(column + t)]) if ok else math.nan
+        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
     return base.FilePreview(tuple(sources), options, (*notes, *(reason for _, reason in guessed)))
 
 
