@@ -439,6 +439,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         ended = "`solve` can run. It tests whether the coarse simulation (warnings below) changes the estimates."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
+    yield from issue_summary_blocks(result, with_verdict=False)
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     yield f"Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
@@ -472,7 +473,6 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}")
     yield convergence["message"]
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:
         name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
