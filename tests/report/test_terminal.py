@@ -189,14 +189,17 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     weak = solved(parameters={"a": parameter("weak")})
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
     lines = told("yid-compare/1", compared(methods=methods, judged=weak, published={"a": 1.0}))
-    assert "Use no value, because these recordings determine no parameter." in lines
+    assert any(line.startswith("Use no value, because these recordings determine no parameter.") for line in lines)
     assert line_of(lines, "cost (half the sum of (error/noise)^2)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
     lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods fit equally well: their costs hardly differ (0 at most)." in lines) == (said, True)
+    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ (0 at most)." in lines) == (
+        said,
+        True,
+    )
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
@@ -205,10 +208,9 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
-    assert lines[0].startswith("Do not use the columns single_shooting, late, because these methods ignore noise")
+    assert lines[0].startswith("Do not use the columns single_shooting, because these methods ignore noise")
     assert "a is 9 ± 0.1 N m/rad by the best fit, but 7 by single_shooting (more than 2 std away)." in lines
-    assert line_of(lines, "parameter").split()[2:6] == ["late", "best", "fit", "unit"]
-    assert "a          7                stopped  9 ± 0.1   N m/rad  found" in lines
+    assert line_of(lines, "parameter").split()[2:5] == ["best", "fit", "unit"], "a method without a value has no column"
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
 
@@ -284,7 +286,8 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     [
         ([f"a@joint{i}.tau_c" for i in range(1, 8)], "a@joint1.tau_c to a@joint7.tau_c"),
         (["T1.bend", "T2.bend"], "T1.bend, T2.bend"),
-        (["j1.c", "tip.mass", "j3.c", "j2.c", "j5.c"], "j1.c to j3.c, tip.mass, j5.c"),
+        (["j1.c", "tip.mass", "j3.c", "j2.c", "j4.c", "j6.c"], "j1.c to j4.c, tip.mass, j6.c"),
+        (["T1.c", "T2.c", "T3.c"], "T1.c, T2.c, T3.c"),
         ([f"w{i}.x{j}" for i in range(2) for j in range(9, 12)], "w0.x9 to w0.x11, w1.x9 to w1.x11"),
         (["j01.c", "j02.c", "j03.c", ""], "j01.c, j02.c, j03.c, "),
         ([f"{c}.gain" for c in "abcdefghijklmnopqrst"], ", ".join(f"{c}.gain" for c in "abcdefghijkl") + " and 8 more"),
