@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, parameter_verdict
-from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, inspect_summary, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "data_trusted": True}
@@ -52,7 +52,7 @@ def information(**changes) -> dict:
 def judged(said: str) -> dict:
     return {
         "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_unknown": 0.6, "std_alone": 0.3,
-        "verdict": said, "verdict_unknown": "weak", "interval": None,
+        "verdict": said, "verdict_unknown": "weak", "interval": None, "std": 1.0,
     }  # fmt: skip
 
 
@@ -122,8 +122,8 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     first += "is 41.7; noise alone gives 1). To find the cause, check the stated noise and run `yid-ocp diagnose`."
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "Until then, treat these values as rough: a. Their ± is at most 10 % and includes the model error, but an "
-    sure += "effect that the model lacks can shift them further."
+    sure = "Until then, treat these values as rough: a. Their ± is at most 10 % and includes the model error. "
+    sure += "They are in doubt, as an effect that the model lacks can shift them further."
     assert [" ".join(lines[:3]), " ".join(lines[3:5])] == [first, sure]
     for std, data in ((0.21, BAD), (0.1, BAD | {"data_trusted": False})):
         unsure = solved(fit=data, parameters={"a": parameter("not_trusted") | {"std": std}})
@@ -136,9 +136,13 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert "The model does not explain the recordings, so agreement of methods does not confirm the values." in lines
     assert line_of(lines, "a  ").split()[-2:] == ["in", "doubt"]
     change = {"verdict": "weak", "std_relative": 2.0, "components": {"b": 0.6, "a": -0.8, "c": 0.01}, "words": ""}
-    doubtful = information(parameters={"a": judged("not_trusted")}, fit=BAD, directions=[change])
+    both = {"a": judged("not_trusted"), "b": judged("not_trusted") | {"value": 0.0}}
+    doubtful = information(parameters=both, fit=BAD, directions=[change], start="unknown", grasp_std=0.01)
     lines = told("yid-identifiability/1", doubtful)
-    assert (" ".join(lines[:3]), "a -160 %, b +120 %" in lines) == (first, True)
+    assert (" ".join(lines[:3]), "a -160 %, b +2.4 N m/rad" in lines) == (first, True)
+    assert "1 N m/rad" in line_of(lines, "b"), "there is no percentage of zero"
+    again = line_of(lines, "compute exact intervals, which may be asymmetric")
+    assert again.endswith(" --intervals all --unknown-grasp --unknown-start")
     assert line_of(lines, "find the cause of the model's error").endswith(" yid-ocp diagnose CONFIG")
 
 
@@ -159,6 +163,7 @@ def test_a_held_out_error_far_above_noise_is_said_first(error, noise, fit, said)
     text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:15]))
     assert ("You can use these values" in text) == (fit is GOOD and error < 6 * noise)
     assert ("shows a gap" in text, (said or "") in text) == (bool(said), True)
+    assert not ("does not explain" in text and "predicts them well" in text)
 
 
 def test_an_interval_is_shown_of_every_number_that_is_known():
