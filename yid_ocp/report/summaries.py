@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
@@ -111,7 +112,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
-    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
+    which = "chosen fit" if result.get("safeguard") else "fit"
+    yield f"End of the {which}: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -508,6 +510,10 @@ def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for channel, known in noise.items():
         std, offset = (" ".join(value_text_and_display_unit(known.get(k), known["unit"])) for k in ("std", "bias_std"))
         source = "estimated" if known.get("estimated") else "stated"
+        recorded = known.get("recorded_std")
+        if recorded is not None and not math.isclose(recorded, known["std"] or 0.0, rel_tol=0.01):
+            size = " ".join(value_text_and_display_unit(recorded, known["unit"]))
+            source += f" {size}, low-pass filtered, with the noise of the angles"
         if known["std"] is not None:
             yield channel, std, offset * bool(known.get("bias_std")), source
 
@@ -529,7 +535,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @register_summary("yid-track/1")
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
-    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
+    heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
     rows: TableRows = [("point", "images", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
@@ -538,6 +544,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
     used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
     yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Tracked points", is_key_table=True)
     for why, n in result["dropped"].items():

@@ -5,6 +5,7 @@ Recordings are checked first: duplicates count once, and gaps are cut out. Other
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -144,7 +145,8 @@ def build_problem(
         _refuse_object_mounted_on_driven_arm(run, system)
     free = free_parameter_names(run, system.parameters)
     if not free:
-        names = sorted(system.parameters.names, key=lambda name: (name not in run.parameters, name.endswith(".mass")))
+        named = {name for name in system.parameters.names for key in run.parameters if fnmatch.fnmatchcase(name, key)}
+        names = sorted(system.parameters.names, key=lambda name: (name not in named, name.endswith(".mass")))
         allowed = ", ".join(names[:8]) + f" and {len(names) - 8} more" * (len(names) > 8)
         what, hint = "no parameter is free, so there is nothing to estimate", f"set parameters.{names[0]}.free: true"
         raise run.config_error(what, "parameters", allowed=f"one free parameter or more, among {allowed}", hint=hint)
