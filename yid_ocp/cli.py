@@ -69,7 +69,7 @@ def _printing(parser: argparse.ArgumentParser, path: str) -> None:
 
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     _configured(parser, optional)
-    text = "stop with exit code 2 if any recording has an issue"
+    text = "stop with exit code 2 if any recording has an issue (`check`: also if the model has a warning)"
     _setting(parser, "--strict", "recordings.stop_on_any_issue=true", text)
 
 

@@ -65,8 +65,9 @@ def p_value_text(p_value: float, relation: str = "") -> str:
 
 
 def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES_IN_LINE) -> str:
-    """Join names to one line of text. Three or more with consecutive numbers are merged, as in `joint1 to joint7`.
+    """Join names to one line of text. Three or more that end in consecutive numbers become `joint1 to joint7`.
 
+    Four or more are merged if text follows the number: `T1.bend to T3.bend` would seem to contain `T1.twist`.
     The line has at most `max_entries` entries, followed by the number of omitted names.
     """
     parts = [re.split(r"(\d+)", name) for name in names]
@@ -83,7 +84,8 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
                 if following not in parts:
                     break
                 run.append(parts.index(following))
-            if len(run) > max(2, len(longest)) and not taken.intersection(run):
+            least = 3 if own[at + 1 :] == [""] else 4
+            if len(run) > max(least - 1, len(longest)) and not taken.intersection(run):
                 longest, text = run, f"{names[i]} to {names[run[-1]]}"
         taken.update(longest)
         if len(said) < max_entries:

@@ -122,7 +122,7 @@ def offset(torque, column, *, rubs=False):
 ARM_FLIPPED = {"right_s0": 1.390, "right_s1": 2.551, "right_e0": 1.165, "right_e1": 1.364, "right_w0": 1.022}
 SIGNS = [("effort_sign", name, ratio, f"of {name} has") for name, ratio in ARM_FLIPPED.items()]
 THOUSAND = [("effort_limits", "right_s1", 562.7, "732 times its effort limit (50 N m; 1.3 times is")]
-THOUSAND += [("effort_gain", "", 388.8, "efforts are 1.2e+03 times")]
+THOUSAND += [("effort_gain", "", 388.8, "efforts are 1200 times")]
 EFFORTS = {
     "as recorded": (1, lambda j: j.effort, []),
     "as recorded by two": (2, lambda j: j.effort, []),

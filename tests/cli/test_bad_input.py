@@ -93,6 +93,11 @@ def test_no_such_configuration(cli, pendulum):
 
 def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):
     assert_refused(cli("solve", pendulum, "--set", "parameters={}"), "no parameter is free")
+    fixed = "parameters={'elbow.*ss': {free: false}}"
+    assert_refused(
+        cli("solve", pendulum, "--set", "parameters={}", "--set", fixed),
+        "try: set parameters.elbow.stiffness.free: true",
+    )
     assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording is listed for estimation")
     assert_refused(cli("solve", pendulum, "--set", "model={}"), "neither a robot nor an object")
     assert_refused(cli("solve", pendulum, "--set", "problem.time_step"), "KEY=VALUE")

@@ -227,7 +227,11 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
     code = command_runner.run_command_and_print(asked(quiet=quiet), work)
     captured = capsys.readouterr()
     assert code == (command_runner.EXIT_DONE if reached else command_runner.EXIT_FAILED)
-    expected = (f"{folder}\n", "") if quiet else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
+    expected = (
+        (f"{folder}\n", "" if reached else "a = 1\n")
+        if quiet
+        else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
+    )
     assert (captured.out, captured.err) == expected
 
 

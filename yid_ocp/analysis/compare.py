@@ -83,7 +83,7 @@ def compare_methods(
             if callback is not None:
                 callback(name, entry)
             if time.perf_counter() - begun > share:
-                raise StopSearch(f"stopped after {share:.3g} s, its part of compare.total_time_budget (raise it)")
+                raise StopSearch(f"stopped at its part of compare.total_time_budget, {share:.3g} s (raise it)")
 
         return told
 
@@ -125,7 +125,7 @@ def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, P
         if abs(entry.value - reference.value) > max(_AGREEMENT_STDS * std, _AGREEMENT_RTOL * abs(reference.value)):
             values.append(f"{name} = {entry.value:.4g} {entry.unit} (not {reference.value:.4g})")
     if run.solution.status != Status.CONVERGED:
-        why = f"it ended as {run.solution.status.value} before it reached the minimum"
+        why = "it stopped before it reached the minimum"
     elif run.whitened_cost > best.whitened_cost + 2.0:
         why = "it stopped in another local minimum, whose cost is higher"
     else:

@@ -367,7 +367,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             guess, unit = rms.get(best, np.inf), units[channels[0]]
             if error > _WORSE_RATIO * guess:
                 what = f"the rms error of the model is {error:.3g} {unit}, but the guess '{best}' without a model has "
-                what += f"only {guess:.3g} {unit} (the error of the model may be {_WORSE_RATIO:g} times as large)"
+                what += f"only {guess:.3g} {unit} ({_WORSE_RATIO:g} times is tolerated)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])

@@ -191,7 +191,7 @@ def _profiles(
             said = uncertainty.apply_profile_interval(entry, found.interval, size)
         return found, said
 
-    progress.begin_stage(f"computing 95 % intervals of {len(wanted)} parameters")
+    progress.begin_stage(f"computing 95 % intervals of {count_with_noun(len(wanted), 'parameter')}")
     pairs = apply_function_per_parameter_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}

@@ -390,13 +390,16 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
     fit = fit if common == 1.0 else _fitted(replace(data, effort=common * effort))
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < _MAX_EXPLAINED_RMS) & (np.abs(fit.offset) < 3 * _OFFSET_FRACTION * size)
+    usual = 1.0
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), _MIN_FITTED_STD))
-        if not 1 / factor < scale < factor:
-            words = f"efforts are {scale:.2g} times the required ones (1/{factor:g} to {factor:g} times is tolerated)"
+        # the fitted gains and the sizes of the efforts must give one scale, or each joint is compared with 1
+        if not 1 / factor < scale < factor and 1 / factor < scale * common < factor:
+            words = f"efforts are {_ratio_text(scale)} times the required ones "
+            words += f"(1/{factor:g} to {factor:g} times is tolerated)"
             advice = f"divide the efforts in the file by {1 / common:g}, if they are in another unit than N m"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
-            common = 1.0  # said; each joint is compared with the others
+            usual, common = 1 / common, 1.0  # said; each joint is compared with the others
     turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
     yield from _signs(arm, fit, turned, told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3))
     for j in np.flatnonzero(sound & ~turned):
@@ -404,8 +407,10 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion require. The "
-            words += f"ratio is {off:.3g} of its standard deviations away from 1 ({_MIN_Z:g} are tolerated)"
+            words = (
+                f"the effort of {names[j]} is {_ratio_text(usual / inverse)} times what gravity and motion require. "
+            )
+            words += f"The ratio is {off:.3g} of its standard deviations away from {usual:g} ({_MIN_Z:g} are tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
@@ -417,6 +422,10 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         words += f"({_WRONG_ROBOT_RMS:g} times is tolerated)"
         advice = "check that the recording is of this robot, and check its unit of time and the order of its joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
+
+
+def _ratio_text(ratio: float) -> str:
+    return f"{float(f'{ratio:.2g}'):g}"  # two digits, without an exponent
 
 
 def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:

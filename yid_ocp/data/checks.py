@@ -149,7 +149,8 @@ def _few_samples(recording: Recording, span: float) -> Iterator[Issue]:
             first = f" in the first {span:g} s" * (count < len(group.t))
             what = f"{group.name} has only {count_with_noun(count, 'sample')}{first} (at least {least} are needed)"
             severity: IssueSeverity = "not_trusted" if is_serious else "warning"
-            advice = "set a longer problem.duration" if first else "check if the file is complete; else record longer"
+            advice = "if samples are lost, import the file again. If not, record longer"
+            advice = "set a longer problem.duration" if first else advice
             yield Issue("few_samples", what, severity, least / count, advice, "", group.name)
 
 

@@ -485,8 +485,8 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
     size = f"chi2 per degree of freedom is {chi2}; noise alone gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
         chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
-        said = "It is not certain whether the model explains the recordings, because noise may cause the error"
-        return f"{said} ({size}{chance}). More data can decide this."
+        said = "The errors are larger than noise usually leaves them, so the model may lack a small effect"
+        return f"{said} ({size}{chance}). To confirm the values, add recordings or run `yid-ocp diagnose`."
     if explains:
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"

@@ -288,7 +288,8 @@ def _plan(
     elif not chosen.is_converged:
         message = f"plan.max_iterations ended the search ({rounds}). Use this motion, or raise the limit"
     precisions, unidentifiable = _parameters(experiment, w)
-    lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured_problem.free}
+    hidden = [name for name, own in precisions.items() if name in unseen and own.verdict == "not_identifiable"]
+    lost = {name: _would_see(experiment, name, w) for name in hidden}
     return InformativeMotionPlan(
         experiment.simulator,
         w,

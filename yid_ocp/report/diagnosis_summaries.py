@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import statistics
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -320,9 +320,10 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
 
 @SUMMARIES.register("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    methods, judged = result["methods"], result["judged"]
+    known, judged = result["methods"], result["judged"]
+    stopped = [m for m, e in known.items() if e["status"] == "iteration_limit" and not e["iterations"]]  # no values
+    methods = {method: entry for method, entry in known.items() if method not in stopped}
     runs = methods | {"best fit": judged}
-    stopped = [m for m, e in methods.items() if e["status"] == "iteration_limit" and not e["iterations"]]
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
     for name, own in judged["parameters"].items():
@@ -333,40 +334,39 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 # elsewhere, and without noise, the curvature is no measure of uncertainty
                 ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
                 std, interval = (found["std"], found["interval"]) if ended else (None, None)
-                text = value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"])
-                cells.append("stopped" if method in stopped else text)
+                cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
     agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
-    objections = [*_objections_to_agreement(result, stopped)] or [agree]
+    objections = [*_objections_to_agreement(result, methods)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    costs = [entry["whitened_cost"] for name, entry in methods.items() if name not in stopped]
+    costs = [entry["whitened_cost"] for entry in methods.values()]
     best = f"The method with the lowest cost, {result['reference']}, fits best."
     if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
-        best = f"All methods fit equally well: their costs hardly differ ({spread:.1g} at most)."
+        best = f"All methods of the table fit equally well: their costs hardly differ ({spread:.1g} at most)."
     yield "" if result["disturbed"] else best
     for name, entry in methods.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
-    yield from (f"{n} {sentence}." for n, entry in methods.items() for sentence in entry["disagreements"])
+    yield from (f"{n} {sentence}." for n, entry in known.items() for sentence in entry["disagreements"])
     steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
     yield next_steps_table(result, steps)
 
 
-def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]) -> Iterator[str]:
+def _objections_to_agreement(result: Mapping[str, Any], methods: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
-    methods, own, fit = result["methods"], result["judged"]["parameters"], result["judged"]["fit"]
+    own, fit = result["judged"]["parameters"], result["judged"]["fit"]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
         yield "Use the column `best fit`, which includes this noise and has the verdicts."
         for name, e in found.items():
-            values = {m: one["parameters"][name]["value"] for m, one in methods.items() if m not in stopped}
+            values = {m: one["parameters"][name]["value"] for m, one in methods.items()}
             off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
             if off:
                 said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
@@ -376,15 +376,16 @@ def _objections_to_agreement(result: Mapping[str, Any], stopped: Collection[str]
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not found:
-        yield "Use no value, because these recordings determine no parameter."
+        yield "Use no value, because these recordings determine no parameter. `yid-ocp identifiability` shows why."
     elif not result["agree"] and not result["disturbed"]:
-        yield "The methods do not agree. Use the column `best fit`, whose cost is lowest (reasons: below the tables)."
+        yield f"Use the column `best fit` (by {result['reference']}). The reasons why other values differ are below."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
     yield "quantity", *methods
-    yield "status", *(entry["status"].replace("_", " ") for entry in entries)
+    by_time = "compare.total_time_budget"  # named by the message of what the time stopped
+    yield "status", *("time limit" if by_time in e["message"] else e["status"].replace("_", " ") for e in entries)
     costs = ("failed" if (x := entry["whitened_cost"]) is None else f"{x:.6g}" for entry in entries)
     yield "cost (half the sum of (error/noise)^2)", *costs
     chi2 = "chi2 per degree of freedom (noise alone: 1)"

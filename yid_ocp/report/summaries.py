@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
@@ -22,7 +23,6 @@ from yid_ocp.report.terminal import (
     MAX_CHANNELS_SHOWN_SINGLY,
     MAX_NOISE_RATIO,
     SUMMARIES,
-    CodeBlock,
     SummaryBlockOrTextIterator,
     SummaryStatement,
     SummaryTable,
@@ -51,10 +51,7 @@ _BASELINE_DESCRIPTIONS = {
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
-_MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
-_MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
-_NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
 @SUMMARIES.register("yid-solve/1")
@@ -97,9 +94,10 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             std = f"{entry['std']:.2g}"
         std *= verdict not in ("", "at_bound") and entry["value"] not in (entry["lower"], entry["upper"])
         interval = _interval_cell(entry, entry["std"]) if converged else ""
-        own = ("–" if verdict == "not_identifiable" else value, std, interval, shown_unit(entry["unit"]))
+        value = "–" if verdict == "not_identifiable" or std == "infinite" else value
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
-        rows.append((name, *own, said, bound_range_text(entry, 4), entry.get("meaning", "")))
+        more = (shown_unit(entry["unit"]), said, bound_range_text(entry, 4), entry.get("meaning", ""))
+        rows.append((name, value, std, interval, *more))
     yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True)
     rows = [("channel", "error", "unit", "samples")]
     for name, entry in result["residuals"].items():
@@ -114,7 +112,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
     yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
-    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
+    which = "chosen fit" if result.get("safeguard") else "fit"
+    yield f"End of the {which}: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -125,6 +124,8 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
     if not result["fit"]["data_trusted"]:
         steps["estimate again, after the advice above is followed"] = "solve"
+        if any("yid-ocp diagnose" in own["advice"] for own in result.get("issues", ())):
+            steps["find what the model lacks, as advised above"] = "diagnose"
     elif not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif len(lost) < len(free):
@@ -189,8 +190,10 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
     is_large = any(error > MAX_NOISE_RATIO * noise for error, noise in known if error and noise)
     said = "An error above twice that of noise alone shows an error of the model."
-    said = said if is_large else "No error exceeds twice that of noise alone, so the model predicts them well."
-    yield f"{said} Noise alone includes expected errors of torques, sensors and clocks." if known else ""
+    small = "model predicts them well" if result["fit"]["explains"] else "error of the model is small, but above noise"
+    said = said if is_large else f"No error exceeds twice that of noise alone, so the {small}."
+    said += " Noise alone includes expected errors of torques, sensors and clocks."
+    yield said if any(row[3] for row in rows[1:]) else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -253,12 +256,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield SummaryStatement(said, "verdict")
         return
     is_initial = result["at"] == "initial"
-    rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", "95 % interval", "verdict")]
+    interval_head = "95 % interval" if result["profiles"] else "95 % interval (approximate)"
+    rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", interval_head, "verdict")]
     for name, entry in parameters.items():
         std = entry["std_relative"]
         spread, absolute = "infinite", None
         if std is not None:
-            spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", std * abs(entry["value"])
+            spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", entry["std"]
+            spread = spread if entry["value"] else f"{absolute:.2g} {entry['unit']}"
         interval = _interval_cell(entry, None if is_initial else absolute)
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
@@ -287,7 +292,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield said if own != [cause] else f"{cause}."
     yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
-    weak_changes = [*_weak_combined_changes(result["directions"])]
+    weak_changes = [*_weak_combined_changes(result["directions"], parameters)]
     said = "Some parameters can replace each other: the recordings hardly change if all parameters of a line change "
     said += "together, as stated in % of their values. Measure the first one in another way and fix it."
     yield said if weak_changes else ""
@@ -319,25 +324,42 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
-        name = f"parameters.{(unseen or lost or weak)[0]}"
+        first = [row[0].partition(" ")[0] for row in weak_changes[:1]]  # the text asks to fix it
+        name = f"parameters.{(first or unseen or lost or weak)[0]}"
         if asked and asked["smallest"]:
-            again = f"estimate from FILE, a recording with {asked['smallest'][0]['words']}"
-            steps[again] = "solve --set 'recordings.estimate=[FILE]'"
-        elif not any("springs in series" in words for words in hidden):  # of these, more markers are needed
+            words = asked["smallest"][0]["words"]
+            points = result.get("groups_with_chosen_points", ()) if "seen by" in words else ()
+            options = "".join(f" --set sensors.{group}.used_points=null" for group in points)
+            why = f"estimate from FILE, a recording with {words}"
+            steps[why] = f"solve --set 'recordings.estimate=[FILE]'{options}"
+        # servos cannot follow a planned motion exactly, and springs in series need more markers
+        elif not result.get("has_servos") and not any("springs in series" in text for text in hidden):
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         steps["fix a parameter whose VALUE is known"] = f"solve --set {name}.free=false --set {name}.initial=VALUE"
         steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
+    allowed_for = " --unknown-grasp" * (result.get("grasp_std") is not None)
+    allowed_for += " --unknown-start" * (result.get("start") == "unknown")
+    steps = {why: text + allowed_for * text.startswith("identifiability") for why, text in steps.items()}
     yield next_steps_table(result, steps)
 
 
-def _weak_combined_changes(directions: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str]]:
+def _weak_combined_changes(
+    directions: Sequence[Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[str]]:
     """Yield table rows with the changes of several parameters together that the recordings determine only weakly."""
     for entry in directions:
         changes = {name: entry["std_relative"] * part for name, part in entry["components"].items()}
         order = sorted(changes, key=lambda name: -abs(changes[name]))
         named = [name for name in order if abs(changes[name]) > _MIN_NAMED_SHARE * abs(changes[order[0]])]
         if entry["verdict"] == "weak" and len(named) > 1:
-            yield (", ".join(f"{name} {100 * changes[name]:+.3g} %" for name in named[:_MAX_CHANGES]),)
+            yield (", ".join(_change_text(name, changes[name], parameters[name]) for name in named[:_MAX_CHANGES]),)
+
+
+def _change_text(name: str, relative: float, entry: Mapping[str, Any]) -> str:
+    """Return a parameter's change in % of its value, or in its unit if the value is zero."""
+    if entry["value"]:
+        return f"{name} {100 * relative:+.3g} %"
+    return f"{name} {relative * entry['std'] / entry['std_relative']:+.2g} {entry['unit']}"
 
 
 @SUMMARIES.register("yid-plan/1")
@@ -438,6 +460,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         ended = "`solve` can run. It tests whether the coarse simulation (warnings below) changes the estimates."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
+    yield from issue_summary_blocks(result, with_verdict=False)
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     yield f"Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
@@ -471,7 +494,6 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}")
     yield convergence["message"]
     yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    yield from issue_summary_blocks(result, with_verdict=False)
     alike = dict[str, list[str]]()  # names of the recordings by warning
     for text in warnings:
         name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
@@ -487,80 +509,12 @@ def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     for channel, known in noise.items():
         std, offset = (" ".join(value_text_and_display_unit(known.get(k), known["unit"])) for k in ("std", "bias_std"))
         source = "estimated" if known.get("estimated") else "stated"
+        recorded = known.get("recorded_std")
+        if recorded is not None and not math.isclose(recorded, known["std"] or 0.0, rel_tol=0.01):
+            size = " ".join(value_text_and_display_unit(recorded, known["unit"]))
+            source += f" {size}, low-pass filtered, with the noise of the angles"
         if known["std"] is not None:
             yield channel, std, offset * bool(known.get("bias_std")), source
-
-
-@SUMMARIES.register("yid-inspect/1")
-def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    roles = [entry["role"] for entry in result["variables"]]
-    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
-    m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None}
-    hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    text = "All free parameters change the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
-    if hidden:
-        text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
-        text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if changes else "", "conclusion")
-    size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
-    yield SummaryStatement(f"The model has {size}.", "verdict")
-    radius = linear["spectral_radius"]
-    grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
-    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
-    yield SummaryStatement(said, "verdict")
-    rows, equations = _dependence_rows(result)
-    yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
-    title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
-    yield SummaryTable(equations, title, is_page_only=not result["asked"])
-    rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
-    for name in result["asked"] or result["parameters"]:
-        entry = result["parameters"][name]
-        cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
-        rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
-    yield SummaryTable(rows, "All parameters")
-    for entry in result["entries"]:
-        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
-        yield CodeBlock("\n".join(entry["lines"]))
-        yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
-    files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
-    yield f"The folder has equations.txt (all equations and their names), {files}."
-    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
-
-
-def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
-    """Return how a change of each named (else each free) parameter changes the readings, and the equations with it."""
-    known: Mapping[str, Mapping[str, Any]] = result["dependence"]
-    shown = [name for name in known if result["parameters"][name]["free"]]
-    visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
-    moved: TableRows = [("parameter", "change", "effect on all readings / noise", visible, "most sensitive sensor")]
-    equations: TableRows = [("parameter", "equations", "observed by sensors")]
-    for name in dict.fromkeys(result["asked"] or shown):
-        own, change = known[name], _shown_change(result["parameters"][name])
-        rows, seen = own["rows"], own["seen"]
-        observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
-        sight = "" if seen is None or not rows else observed
-        along = is_visible = ""
-        if own["along"] is not None:
-            size = own["along"] * change
-            along = f"{size:.3g}" if size > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
-            is_visible = "yes" if size >= _MIN_VISIBLE_CHANGE else "no"
-        best = own["best"] or "–" * (seen is not None)
-        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, best))
-        equations.append((name, _row_names_text(rows), sight))
-    return moved, equations
-
-
-def _shown_change(parameter: Mapping[str, Any]) -> float:
-    """Return the change for which `inspect` shows the change of readings: 10 % of value or largest bound, or 1 unit."""
-    limit = max(abs(parameter[key] or 0.0) for key in ("lower", "upper"))
-    return abs(parameter["value"]) / 10 or limit / 10 or 1.0
-
-
-def _row_names_text(names: Sequence[str]) -> str:
-    """Return names of equations in one line, or only their number if that line would be too long."""
-    text = abbreviated_names_text(names)
-    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
 
 
 @SUMMARIES.register("yid-simulate/1")
@@ -580,7 +534,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 @SUMMARIES.register("yid-track/1")
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
-    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
+    heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
     rows: TableRows = [("point", "images", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
@@ -589,6 +543,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from issue_summary_blocks(result)
     used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
     used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
     yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Tracked points", is_key_table=True)
     for why, n in result["dropped"].items():

@@ -176,7 +176,7 @@ def misfit_summary_blocks(
         limit, doubted = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD, fit["data_trusted"] and not is_coarse
         known = [name for name, std in stds.items() if std is not None and std <= limit * values[name]]
         said = f"Until then, treat these values as rough: {abbreviated_names_text(known)}. Their ± is at most 10 % and "
-        said += "includes the model error, but an effect that the model lacks can shift them further."
+        said += "includes the model error. They are in doubt, as an effect that the model lacks can shift them further."
         yield SummaryStatement(said if known and doubted else "", "conclusion")
 
 

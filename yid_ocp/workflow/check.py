@@ -36,6 +36,7 @@ from yid_ocp.workflow.run_inputs import input_files_by_name
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
+_LEAST_POINT_NOISE = 1e-6  # [m]
 _STIFFNESS_UNITS = ("N m^2", "N m/rad", "N/m")
 
 
@@ -106,6 +107,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
     recording, system, arm = episode.recording, problem.system, episode.recording.joints
+    noise_std_of = joints.joint_torque_noise_std
     noise, share = _input_noise(problem, episode), problem.options.excess_residual_criteria.noise_fraction_of_stated_std
     for samples in episode.measurements:
         known = samples.std[np.isfinite(samples.std)]
@@ -114,6 +116,15 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": share * float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
+        group = samples.sensor.group_name
+        if arm is not None and group == joints.JOINT_EFFORT_SENSOR_KEY:
+            choice, names = problem.options.sensors.get(group, SensorOptions()), samples.sensor.effort_joints
+            noise[group]["recorded_std"] = float(np.median(noise_std_of(arm, names, choice, episode.name)))
+        if known.size and samples.sensor.unit == "m" and np.median(known) < _LEAST_POINT_NOISE:
+            size = f"{1e3 * np.median(known):.2g} mm"
+            said = f"the stated noise of {group} is {size}, less than any sensor of points has. "
+            said += f"Set sensors.{group}.std to that of your sensor [m]"
+            warnings.append(f"in '{episode.name}', {said}")
     groups, span = {}, problem.options.duration
     used = recording if span is None else recording.time_slice(-math.inf, episode.grid.start_time + span)
     for own in used.all_groups:
@@ -225,7 +236,9 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
-        _warn(found, "the links are", links, item.divided_links_setting_text, rows)
+        per_joint = [name for name in values if link_division_parameter_scale(run, name, 2) != 1]
+        double = f" and double the initial values per joint ({abbreviated_names_text(per_joint)})" * bool(per_joint)
+        _warn(found, "the links are", links, f"{item.divided_links_setting_text}{double}", rows)
     return found
 
 

@@ -19,8 +19,8 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
-from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
-from yid_ocp.report.terminal import aligned_table_lines, summary_blocks, summary_terminal_lines
+from yid_ocp.report import diagnosis_summaries, inspect_summary, summaries  # noqa: F401, they register
+from yid_ocp.report.terminal import SummaryStatement, aligned_table_lines, summary_blocks, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -60,6 +60,9 @@ def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progres
     path, near, result = str(outcome.folder), os.path.relpath(outcome.folder), outcome.result
     place = path if near.startswith("..") else f"run folder: {near}"
     print_result(arguments, result, lambda: summary_terminal_lines(summary_blocks(result)), place, path)
+    if arguments.quiet and not outcome.is_successful:  # the reason of the exit code
+        said = [part for part in summary_blocks(result) if isinstance(part, SummaryStatement)][:1]
+        print("\n".join(summary_terminal_lines(said)), file=sys.stderr)
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 

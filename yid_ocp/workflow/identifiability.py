@@ -21,7 +21,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun, grouped
 from yid_ocp.errors import ConfigError, require_known_names
-from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
+from yid_ocp.files import attributes_to_dict, dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution, Status
@@ -124,7 +124,7 @@ def run_identifiability(
             if isinstance(wanted, str):
                 wanted = names if wanted == "all" or (solution and is_small_enough_for_profiles(problem)) else ()
             if tasks is not None and wanted and set(wanted) <= set(names):
-                progress.begin_stage(f"computing 95 % intervals of {len(wanted)} parameters")
+                progress.begin_stage(f"computing 95 % intervals of {count_with_noun(len(wanted), 'parameter')}")
                 information = tasks.with_profile_likelihoods(information, wanted)
             elif wanted:
                 information = judged(intervals=wanted, progress=progress)
@@ -159,6 +159,8 @@ def _identifiability_result(
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
         "issues": issues_to_plain_data(problem.options.data_issues),
         "what_if": None,
+        "has_servos": bool(problem.system.servos),
+        "groups_with_chosen_points": [n for n, own in problem.options.sensors.items() if own.used_points is not None],
     }
     if information is None or unknown is None:
         result |= {"parameters": {}, "correlations": {"names": [], "matrix": []}}
@@ -169,6 +171,7 @@ def _identifiability_result(
         # less prior knowledge cannot make a parameter better known
         spread = max(entry.std_relative, unsure.std_relative)
         parameters[name] = asdict(entry) | {"std_relative_unknown": spread, "verdict_unknown": unsure.verdict}
+        parameters[name] |= attributes_to_dict(problem.system.parameters[name.split("[")[0]], "lower upper")
     if ranking is not None:
         result["what_if"] = {
             "base": _outcome(ranking.unchanged_experiment),

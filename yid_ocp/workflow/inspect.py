@@ -182,9 +182,24 @@ def _dependence(
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
-    size = np.linalg.norm(at_start.jacobian[problem.residual_rows.data], axis=0)
+    slopes, squares = at_start.jacobian, dict[str, Array]()
+    for i, own in enumerate(problem.episodes):
+        for samples, block in zip(own.measurements, problem.residual_rows.measurements[i], strict=True):
+            group = samples.sensor.group_name
+            squares[group] = squares.get(group, np.zeros(slopes.shape[1])) + np.sum(slopes[block] ** 2, axis=0)
+    size = np.linalg.norm(slopes[problem.residual_rows.data], axis=0)
     along = dict(zip(problem.unknown_names, map(float, size), strict=True))
-    return tuple(replace(entry, change_along_recordings=along.get(entry.parameter)) for entry in found)
+    groups, best = [*squares], np.argmax([*squares.values()], axis=0)
+    sensor = {name: groups[k] for name, k in zip(problem.unknown_names, best, strict=True) if along[name] > 0}
+    return tuple(
+        replace(
+            entry,
+            change_along_recordings=along.get(entry.parameter),
+            # the equations of a step do not contain a delay
+            most_sensitive_sensor=entry.most_sensitive_sensor or sensor.get(entry.parameter, ""),
+        )
+        for entry in found
+    )
 
 
 def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:

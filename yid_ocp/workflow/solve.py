@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -75,7 +75,8 @@ def solve_and_choose_cable_shape_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> estimation.FitWithOrWithoutShapeMemory:
     """Fit the problem with the run's solver, for a cable with or without its shape memory, and return the choice."""
-    progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
+    unknowns = count_with_noun(len(problem.initial_unknowns), "unknown")
+    progress.begin_stage(f"solving for {unknowns} by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
     return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)

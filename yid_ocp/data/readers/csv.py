@@ -36,6 +36,7 @@ from yid_ocp.data.recording import (
     TimestampKind,
     raise_data_error_unless,
 )
+from yid_ocp.display import count_with_noun
 from yid_ocp.errors import DataError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, os_error_reason
 from yid_ocp.sensors import CHANNEL_KINDS
@@ -364,7 +365,8 @@ def _parsed_number(cell: str) -> float:
 
 def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        what, allowed = f"the row has {len(cells)} cells, but the header has {len(header)}", "as many as the header"
+        what = f"the row has {count_with_noun(len(cells), 'cell')}, but the header has {len(header)}"
+        allowed = "as many as the header"
         hint = f"correct the row{_OR_SKIP}"
         if len(cells) > len(header):
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"

@@ -1,0 +1,99 @@
+"""Summary of the result of `inspect`, for the terminal and the HTML report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.inference.uncertainty import percent_number_text
+from yid_ocp.report.terminal import (
+    SUMMARIES,
+    CodeBlock,
+    SummaryBlockOrTextIterator,
+    SummaryStatement,
+    SummaryTable,
+    TableRows,
+    bound_range_text,
+    next_steps_table,
+    shown_unit,
+)
+
+_MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
+_MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
+_NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
+
+
+@SUMMARIES.register("yid-inspect/1")
+def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    roles = [entry["role"] for entry in result["variables"]]
+    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
+    m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
+    asked = result["asked"] or result["dependence"]
+    changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None and n in asked}
+    hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
+    which = "The chosen parameters" if result["asked"] else "All free parameters"
+    text = f"{which} change the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
+    if hidden:
+        text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
+        text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
+    yield SummaryStatement(text if changes else "", "conclusion")
+    size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
+    yield SummaryStatement(f"The model has {size}.", "verdict")
+    radius = linear["spectral_radius"]
+    grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
+    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
+    yield SummaryStatement(said, "verdict")
+    rows, equations = _dependence_rows(result)
+    yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
+    title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
+    yield SummaryTable(equations, title, is_page_only=not result["asked"])
+    rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
+    for name in result["asked"] or result["parameters"]:
+        entry = result["parameters"][name]
+        cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
+        rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
+    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters")
+    for entry in result["entries"]:
+        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
+        yield CodeBlock("\n".join(entry["lines"]))
+        yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
+    files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
+    yield f"The folder has equations.txt (all equations and their names), {files}."
+    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
+
+
+def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
+    """Return how a change of each named (else each free) parameter changes the readings, and the equations with it."""
+    known: Mapping[str, Mapping[str, Any]] = result["dependence"]
+    shown = [name for name in known if result["parameters"][name]["free"]]
+    visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
+    moved: TableRows = [("parameter", "change", "effect on all readings / noise", visible, "most sensitive sensor")]
+    equations: TableRows = [("parameter", "equations", "observed by sensors")]
+    for name in dict.fromkeys(result["asked"] or shown):
+        own, change = known[name], _shown_change(result["parameters"][name])
+        rows, seen = own["rows"], own["seen"]
+        observed = "all" if len(seen or ()) == len(rows) else _row_names_text(seen or ()) or "none"
+        sight = "" if seen is None or not rows else observed
+        along = is_visible = ""
+        if own["along"] is not None:
+            size = own["along"] * change
+            along = f"{size:.3g}" if size > _NEGLIGIBLE_STDS else f"< {_NEGLIGIBLE_STDS:g}"
+            along = f"{size:.0f}" if size > 999 else along
+            is_visible = "yes" if size >= _MIN_VISIBLE_CHANGE else "no"
+        best = own["best"] or "–" * (seen is not None)
+        moved.append((name, f"{change:.3g} {own['unit']}".removesuffix(" 1"), along, is_visible, best))
+        equations.append((name, _row_names_text(rows), sight))
+    return moved, equations
+
+
+def _shown_change(parameter: Mapping[str, Any]) -> float:
+    """Return the change for which `inspect` shows the change of readings: 10 % of value or largest bound, or 1 unit."""
+    limit = max(abs(parameter[key] or 0.0) for key in ("lower", "upper"))
+    return abs(parameter["value"]) / 10 or limit / 10 or 1.0
+
+
+def _row_names_text(names: Sequence[str]) -> str:
+    """Return names of equations in one line, or only their number if that line would be too long."""
+    text = abbreviated_names_text(names)
+    return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
