@@ -42,7 +42,7 @@ def test_springs_that_cannot_be_told_apart(carried_out, repository):
     done = carried_out("identifiability", repository / "configs" / "springs_torsion.yaml", *asked)
     assert ("0 of 2 parameters can be determined" in done.out, "plan a motion" in done.out) == (True, False)
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, like springs in series" in " ".join(done.out.split())
-    assert "Fewest changes with which all parameters would be found: coupling_marker, seen by the camera." in done.out
+    assert "Fewest changes with which all parameters would be found: the point 'coupling_marker', seen" in done.out
     result = done.result
     check_keys(result)
     assert (result["start"], result["nuisances"]) == ("unknown", 4)

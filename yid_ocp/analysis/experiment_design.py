@@ -142,7 +142,8 @@ def measurable_points(system: System) -> list[_MeasurablePoint]:
         found.append(_MeasurablePoint(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
     if system.segment_layouts:
         return found
-    found = [_MeasurablePoint(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
+    frames = [name for name, frame in tree.frames.items() if frame.joint_index >= 0]
+    found = [_MeasurablePoint(name, f"the point '{name}'", False) for name in frames]
     for spring in system.elastic_joints:
         index, name = tree.joint_index(spring.joint_name), spring.joint_name
         if tree.joints[index].kind == "revolute":
