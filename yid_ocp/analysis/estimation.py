@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -70,9 +70,9 @@ def solve(
         text += f" (noise alone gives a cost near {noise_cost:.4g})"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
-    safe = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
-    solution = add_intervals_and_checks(safe.problem, safe.solution, progress)
-    checks = replace(solution.checks or uncertainty.EstimateChecksBeyondFit(), cable_memory_message=safe.message)
+    problem, found, message = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
+    solution = add_intervals_and_checks(problem, found, progress)
+    checks = replace(solution.checks or uncertainty.EstimateChecksBeyondFit(), cable_memory_message=message)
     return replace(solution, checks=checks)
 
 
@@ -185,46 +185,39 @@ _MAX_REST_SPEED = 0.01  # a recording whose points move more slowly at its start
 _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
-@dataclass(frozen=True)
-class FitWithOrWithoutShapeMemory:
-    """The chosen fit, with or without shape memory of the cable. `message` is the reason, empty if none is needed."""
-
-    problem: EstimationProblem
-    solution: Solution
-    message: str = ""
-
-
 def choose_fit_with_or_without_shape_memory(
     problem: EstimationProblem,
     solver: Solver,
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-) -> FitWithOrWithoutShapeMemory:
+) -> tuple[EstimationProblem, Solution, str]:
     """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 
     What loaded such a cable before is unknown, so its motion can be mistaken for memory. Leave-one-out prediction
     decides: each such recording is predicted from all others, with and without memory (by one Gauss-Newton step from
     the fit of all). The memory is kept if its total error is smaller; it is dropped if only one recording moves.
+
+    Returns the chosen problem, its fit and the reason, empty if none is needed.
     """
     starts = [episode.fixed_initial_state for episode in problem.episodes]
     speeds = [0.0 if s is None else s.fitted_parameters.get(INITIAL_RMS_SPEED_PARAMETER, 0.0) for s in starts]
     moving = [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
     if not _memory_parameters(problem) or not moving or solution.evaluation is None:
-        return FitWithOrWithoutShapeMemory(problem, solution)
+        return problem, solution, ""
     without = problem_without_shape_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
     other = solvers.fit_problem(without, solver, without.pack_unknowns(known).tolist(), limits=limits)
     if other.evaluation is None:
-        return FitWithOrWithoutShapeMemory(problem, solution)
+        return problem, solution, ""
     if len(moving) < _MIN_MOVING_RECORDINGS:
         words = f"The estimates are without {_MEMORY_WORDS}. To test it, add a second recording that starts in motion."
-        return FitWithOrWithoutShapeMemory(without, other, words)
+        return without, other, words
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
     errors = f"{_MEMORY_WORDS}. Recordings, each predicted from the others, have an rms error of {kept:.3g} times the "
     errors += f"noise with this memory and {dropped:.3g} times without."
     if kept < dropped:
-        return FitWithOrWithoutShapeMemory(problem, solution, f"The estimates include {errors}")
-    return FitWithOrWithoutShapeMemory(without, other, f"The estimates are without {errors}")
+        return problem, solution, f"The estimates include {errors}"
+    return without, other, f"The estimates are without {errors}"
 
 
 def problem_without_shape_memory(problem: EstimationProblem) -> EstimationProblem:

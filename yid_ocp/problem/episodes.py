@@ -77,6 +77,8 @@ log = logging.getLogger(__name__)
 
 # lowest torque error with encoders, relative to the torque's variation: no model follows encoders without correction
 _MIN_TORQUE_ERROR_FRACTION = 1e-3
+# attributes of `TorqueAndAngleErrorModel` with one row for each step
+_STEPWISE_ERRORS = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,7 @@ class TorqueAndAngleErrorModel:
 
     def on_finer_steps(self, ratio: int) -> TorqueAndAngleErrorModel:
         """Return this model for `ratio` times shorter steps, with torque errors held and angles interpolated."""
-        held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
-        made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
+        made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in _STEPWISE_ERRORS}
         if (known := self.smoothed_reference) is not None:
             at, nodes = np.arange(ratio * len(known)) / ratio, np.arange(len(known))
             made["smoothed_reference"] = np.stack([np.interp(at, nodes, x) for x in known.T], axis=1)
@@ -123,8 +124,7 @@ class TorqueAndAngleErrorModel:
 
     def _truncated_to_steps(self, steps: int) -> TorqueAndAngleErrorModel:
         """The same error model restricted to the first `steps` steps of the rollout."""
-        names = ["sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise"]
-        names += [] if self.smoothed_reference is None else ["smoothed_reference"]
+        names = _STEPWISE_ERRORS if self.smoothed_reference is None else (*_STEPWISE_ERRORS, "smoothed_reference")
         return replace(self, **{name: getattr(self, name)[:steps] for name in names})
 
 

@@ -99,8 +99,7 @@ def run_identifiability(
         limits = run.diagnosis.fit_excess_residual_criteria
         solution = None
         if asked.evaluation_point == "solution":
-            safe = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
-            problem, solution = safe.problem, safe.solution
+            problem, solution = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
         tasks = None
         knowledge: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
         if workers is not None:

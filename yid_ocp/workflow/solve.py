@@ -73,13 +73,13 @@ run_and_return_exit_code = make_command_function(run_solve, "live")
 
 def solve_and_choose_cable_shape_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> estimation.FitWithOrWithoutShapeMemory:
-    """Fit the problem with the run's solver, for a cable with or without its shape memory, and return the choice."""
+) -> tuple[EstimationProblem, Solution]:
+    """Fit with the run's solver, for a cable with or without its shape memory. Returns the chosen problem and fit."""
     unknowns = count_with_noun(len(problem.initial_unknowns), "unknown")
     progress.begin_stage(f"solving for {unknowns} by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
-    return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)
+    return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)[:2]
 
 
 def _iterate_logger(
