@@ -231,7 +231,9 @@ def _refuse_losses(
     lost += [f"grasp {name}" for name, entry in grasps.items() if entry.loses_motion_or_force]
     if lost and not is_lossy:
         parts = grouped((name.partition("@")[0] if "@" in name else name.rpartition(".")[2], name) for name in lost)
-        told = ", ".join(own[0] if len(own) == 1 else f"{kind} ({len(own)} times)" for kind, own in parts.items())
+        told = ", ".join(
+            f"{kind} ({len(own)} times)" if len(own) > 3 else ", ".join(own) for kind, own in parts.items()
+        )
         what, where = f"{form.upper()} cannot represent these parts of the model: {told}", f"--format {form}"
         other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
         hint = f"{other}add --lossy to leave them out, with a manifest that has the reason for each"
