@@ -310,8 +310,8 @@ class _Calibrator:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
         beside = state.state_increment_from(used_state)
         words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
-        seen = f"{100 * presence.there:.0f} % of the arm is seen"
-        words += f". These values are from {len(chosen)} images, in which {seen}."
+        coverage = f"{100 * presence.there:.0f} % of the arm is seen"
+        words += f". These values are from {len(chosen)} images, in which {coverage}."
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: StampedCloud) -> StampedCloud | None:
