@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -259,25 +259,8 @@ def _print_schema(arguments: argparse.Namespace) -> int:
 
 def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
     """Print completions for the calling shell and exit. Without the package argcomplete, return without output."""
-    try:
-        library = import_module("argcomplete")
-    except ImportError:
-        return
-    configurations, folders = library.FilesCompleter(("yaml", "yml")), library.DirectoriesCompleter()
-    completers: Mapping[str, Callable[..., Any]] = {
-        "config": configurations,
-        "configs": configurations,
-        "runs": folders,
-        "baseline": folders,
-        "source": library.FilesCompleter(("h5", "hdf5")),
-        "format": library.ChoicesCompleter(("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")),
-    }
-    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    for command in commands.choices.values():
-        for action in command._actions:
-            if action.dest in completers and action.nargs != 0:
-                action.completer = completers[action.dest]
-    library.autocomplete(parser, always_complete_options="long")
+    with contextlib.suppress(ImportError):
+        import_module("argcomplete").autocomplete(parser, always_complete_options="long")
 
 
 _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and experiments that would determine more"
