@@ -94,10 +94,8 @@ def test_no_such_configuration(cli, pendulum):
 def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):
     assert_refused(cli("solve", pendulum, "--set", "parameters={}"), "no parameter is free")
     fixed = "parameters={'shoulder.*ss': {free: false}}"
-    assert_refused(
-        cli("solve", pendulum, "--set", "parameters={}", "--set", fixed),
-        "try: set parameters.shoulder.stiffness.free: true",
-    )
+    done = cli("solve", pendulum, "--set", "parameters={}", "--set", fixed)
+    assert_refused(done, "for example parameters.shoulder.stiffness.free: true")
     assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording is listed for estimation")
     assert_refused(cli("solve", pendulum, "--set", "model={}"), "neither a robot nor an object")
     assert_refused(cli("solve", pendulum, "--set", "problem.time_step"), "KEY=VALUE")

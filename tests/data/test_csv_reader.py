@@ -132,7 +132,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning of times": (GOOD, {"column_meanings": {"t": "time"}}, "meaning 'time' of column", "'t=t'"),
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:a'"),
-    "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
+    "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cell,", ""),
     "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),
     "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "numbers with commas and numbers with points", ""),
     "time of day": ("t,q_a\n10:20:30,1\n", {}, "the cell '10:20:30' in column 't' is not a number", ""),

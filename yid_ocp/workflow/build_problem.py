@@ -145,9 +145,8 @@ def build_problem(
     free = free_parameter_names(run, system.parameters)
     if not free:
         named = build.settings_by_parameter_name(run, system.parameters)
-        names = sorted(
-            system.parameters.names, key=lambda name: (name not in named, name.endswith((".damping", ".mass")))
-        )
+        unlikely = (".damping", ".mass")
+        names = sorted(system.parameters.names, key=lambda name: (name not in named, name.endswith(unlikely)))
         allowed = ", ".join(names[:8]) + f" and {len(names) - 8} more" * (len(names) > 8)
         what = "no parameter is free, so there is nothing to estimate"
         hint = f"free those to estimate, for example parameters.{names[0]}.free: true"
