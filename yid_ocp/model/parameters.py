@@ -38,10 +38,8 @@ class Parameter:
             side, bound = ("below its lower", self.lower) if is_low else ("above its upper", self.upper)
             allowed = f"{'at least' if is_low else 'at most'} {bound:g} {self.unit}"
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
-            where, hint = (
-                f"parameters.{self.name}",
-                f"change parameters.{self.name}.initial, or `bounds` if you set them",
-            )
+            where = f"parameters.{self.name}"
+            hint = f"change {where}.initial, or `bounds` if you set them"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 
