@@ -156,12 +156,11 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
     origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
-    sensors = {own.channel.rpartition(".")[0] for own in result.noise_floor}
-
-    def words(place: str) -> str:
-        return f"the readings of {place}" if place in sensors else place
-
-    parts = [(p.gap_share, " or ".join(map(words, [p.location, *p.indistinguishable_from]))) for p in where]
+    groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
+    words = {group: f"the readings of {group}" for group in groups}
+    alike = ([p.location, *p.indistinguishable_from] for p in where)
+    texts = [" or ".join(words.get(place, place) for place in places) for places in alike]
+    parts = [(place.gap_share, text) for place, text in zip(where, texts, strict=True)]
     named = [f"{place} ({100 * part:.0f} %)" for part, place in parts]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
