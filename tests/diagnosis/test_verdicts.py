@@ -76,7 +76,7 @@ def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkey
         limits = Thresholds(max_effects=2, budget=1e4, min_excess_chi2_per_dof=-0.5)
         problem = bench.problem(recordings[:1])
         finding = diagnose(problem, FRICTION, recordings[1:], thresholds=limits, progress=progress)
-        said = f"(diagnosis.budget: 10000.0 s) ended the search. Not tried: {finding.untried[0]}"
+        said = f"(diagnosis.budget: 10000.0 s): {finding.untried[0]}"
         assert finding.summary.count(said) == 1
         return json.loads(json.dumps(finding.to_dict(), allow_nan=False))
 

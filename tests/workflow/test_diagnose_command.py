@@ -101,7 +101,7 @@ def test_a_spent_budget_leaves_a_whole_run_folder_that_says_so(rubbing, whole, t
     result = json.loads((hurried.folder / "result.json").read_text())
     assert (result["verdict"], result["effects"]) == ("unknown", [])
     assert result.keys() == json.loads((whole[0].folder / "result.json").read_text()).keys()
-    said = f"s) ended the search. Not tried: {result['untried'][0]}"
+    said = f"s): {result['untried'][0]}"
     assert said in result["summary"]
     assert said in (hurried.folder / "report.html").read_text("utf-8")
     assert load_config(hurried.folder / "config.yaml").diagnosis.budget == 1e-9

@@ -87,9 +87,9 @@ class ParameterShiftsSinceBaseline:
 
     def sentences(self, *, has_rivals: bool) -> list[str]:
         """Return sentences on the changes, unless larger ones explain as much as the effects: `has_rivals`."""
-        moved = [own.text for own in self.significant_parameter_shifts]
-        changed = "Changed since the earlier runs by more than the ± (without common errors of links and time step): "
-        changed += f"{listed(moved)}. If nothing was altered on purpose, find the cause before you use the values."
+        moved = [own.name for own in self.significant_parameter_shifts]
+        changed = f"Changed since the earlier runs by more than the ±: {listed(moved)}. If nothing was "
+        changed += "altered on purpose, find the cause before you use the values."
         p = self.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."

@@ -36,7 +36,7 @@ from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candi
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
-from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress
+from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress, count_with_noun
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
@@ -158,7 +158,7 @@ def _examined(
     least = _LEFT_BY_DISCRETISATION * removed
     evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
-    search.progress.begin_stage(f"screening {len(effects)} candidate effects", 4.0, ahead)
+    search.progress.begin_stage(f"screening {count_with_noun(len(effects), 'candidate effect')}", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
     seen = _Examined(replace(search, problem=composed), *found)
     try:

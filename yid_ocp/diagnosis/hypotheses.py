@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, count_with_noun
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects.friction import lower_smoothing_speed_to_joint_min
 from yid_ocp.errors import ConfigError, DataError, SolverError, unknown_name_error_arguments
@@ -325,7 +325,7 @@ def make_all_candidates_problem(
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     _exclude_candidates(effects, leave_out)  # reject names before compilation
-    progress.begin_stage(f"building one model with all {len(effects)} candidate effects", ahead=19.5)
+    progress.begin_stage(f"building one model with {count_with_noun(len(effects), 'candidate effect')}", ahead=19.5)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
     return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
 

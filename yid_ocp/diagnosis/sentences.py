@@ -14,12 +14,12 @@ from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_senten
 from yid_ocp.display import texts_that_hold as _said
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test, uncertainty
-from yid_ocp.inference.smoother import GapLocation, select_largest_gap_locations
+from yid_ocp.inference.smoother import GapLocation
 from yid_ocp.inference.uncertainty import mask_of_priors_determining_unknown, value_and_uncertainty_text
 
 MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
-_MAX_NAMED = 5  # number of named parameters, the largest changes first, and of named events
+_MAX_NAMED = 5  # number of named parameters, the most significant changes first, and of named events and places
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 GAP_ORIGIN_TEXTS = {
@@ -46,15 +46,14 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
     movable = ", ".join([name for name in first if name not in still])
-    most = f"Record slow and fast motions, with pauses, and most motion where the gap is (part or grasp): {movable}."
+    most = f"Record slow and fast motions, with pauses, above all of {movable}."
     larger = "Record faster and larger motions, which show more effects."
-    since = result.baseline_comparison
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
         "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
-        "unknown": _said((movable, most), (True, larger))[0],
-        "no_gap": _said((since and since.significant_parameter_shifts, changed), (True, enough))[0],
+        "unknown": _said((result.untried, _longer_search(result)), (movable, most), (True, larger))[0],
+        "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
     }
@@ -72,9 +71,20 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += [] if result.counterfactual is None else result.counterfactual.sentences
     text += [note for note, _ in notes]
     text += result.events.overspeed_sentences(result.thresholds.max_joint_speed)
-    steps = [*filter(None, (step for _, step in notes)), result.next_experiment]
+    steps = [*dict.fromkeys([*filter(None, (step for _, step in notes)), result.next_experiment])]
     numbered = " ".join(f"{i}. {step}" for i, step in enumerate(steps, 1))
     return "\n".join([*text, f"Do next: {_said((steps[1:], numbered), (True, steps[-1]))[0]}"])
+
+
+def _changed(result: DiagnosisResult) -> bool:
+    """Whether a parameter changed significantly since the earlier runs."""
+    since = result.baseline_comparison
+    return since is not None and bool(since.significant_parameter_shifts)
+
+
+def _longer_search(result: DiagnosisResult) -> str:
+    used = sum(result.stage_seconds.values())
+    return f"To try the rest, remove diagnosis.budget, or set it far above the {used:.0f} s that this diagnosis took."
 
 
 def _short(number: float) -> str:
@@ -86,11 +96,10 @@ def _lead(result: DiagnosisResult) -> str:
     tests, limits = (result.nominal_test, result.nominal_held_out_test), result.thresholds
     fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
-    p_value = p_value_text(min(test.p_value for test in tests), "of ")
-    chance = f"and so large an error with a probability {p_value}"
+    chance = f"so large an error with the probability p {p_value_text(min(test.p_value for test in tests), '= ')}"
     best, along = _best_candidate(result)
-    large = f"The nominal model has an error beyond noise (a gap): {sizes}, {chance}."
-    small = f"In total the error of the nominal model is within noise: {sizes}. "
+    large = f"Your model (the nominal model) has an error beyond noise (a gap): {sizes}, and {chance}."
+    small = f"In total the error of your model (the nominal model) is within noise: {sizes}. "
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
     gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
@@ -105,7 +114,9 @@ def _lead(result: DiagnosisResult) -> str:
     since += f"changed since the baseline: {moved}."
     shares = sorted([(result.probability, probable), (result.rival_probability, since)], reverse=True)
     probable = " ".join(text for share, text in shares if share)
-    none = f"Use the model for motions like these. There is no relevant gap: {sizes}, {chance}. The recordings {shown}."
+    use = "Use the model for motions like these."
+    use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
+    none = f"{use} There is no relevant gap: {sizes}. The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
     why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
@@ -115,7 +126,7 @@ def _lead(result: DiagnosisResult) -> str:
         "no_gap": none + uncertainty.overstated_noise_sentence(*max((t.chi2_per_dof, t.p_value) for t in tests)),
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
-        "effect": f"Use the model with {names}, not the nominal one{beyond}. {probable} {gap}",
+        "effect": f"Use the model with {names}{beyond}. {probable} {gap}",
     }[result.verdict]
 
 
@@ -134,19 +145,21 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on why a significant residual does not count as a gap, and on effects that could be overlooked."""
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
     (best, along), least = _best_candidate(result), 1 + limits.min_excess_chi2_per_dof
-    is_significant = min(test.p_value for test in tests) < limits.significance_level
-    small = "The error is significantly larger than noise, but does not count as a gap."
-    level = f"p below {limits.gap_significance_level / len(tests):.2g}"
-    needs = f"A gap needs both chi2 per degree of freedom above {least:.4g} and {level}."
+    p_value = min(test.p_value for test in tests)
+    small = (
+        f"The error is significantly larger than noise (p {p_value_text(p_value, '= ')}), but does not count as a gap."
+    )
+    level = limits.gap_significance_level / len(tests)
+    needs = f"A gap needs both chi2 per degree of freedom above {least:.4g} and p below {level:.2g}."
     seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    lines = [" ".join(_said((is_significant, small), (True, needs)))]
+    lines = _said((p_value < limits.significance_level, f"{small} {needs}"))
     return lines + _said((along < limits.gap_significance_level, narrow), (unseen, unseen_effects_sentence(unseen)))
 
 
 def _named_locations(result: DiagnosisResult) -> list[GapLocation]:
-    return [p for p in select_largest_gap_locations(result.gap_locations) if p.gap_share >= MIN_GAP_SHARE]
+    return [place for place in result.gap_locations if place.gap_share >= MIN_GAP_SHARE][:_MAX_NAMED]
 
 
 def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
@@ -160,8 +173,7 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     words = {group: f"the readings of {group}" for group in groups}
     alike = ([p.location, *p.indistinguishable_from] for p in where)
     texts = [" or ".join(words.get(place, place) for place in places) for places in alike]
-    parts = [(place.gap_share, text) for place, text in zip(where, texts, strict=True)]
-    named = [f"{place} ({100 * part:.0f} %)" for part, place in parts]
+    named = [f"{text} ({100 * place.gap_share:.0f} %)" for place, text in zip(where, texts, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
@@ -173,11 +185,12 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     added, limits = result.selected_effects, result.thresholds
     names, total = listed([entry.effect.label for entry in added]), result.closure_by_selected_effects
     removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
-    interval = f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)"
+    low, high = (f"{100 * end:.3g}" for end in (total.ci_low, total.ci_high))
+    interval = f" (95 % interval {low} to {high} %)" * (low != high)
     unknown = f"{removed} an unknown part {of}"
     is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
     closed = _said(
-        (added and math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
+        (added and math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of}{interval}."),
         (added and is_within, f"{unknown}, because the nominal model's error there is within noise."),
         (added, f"{unknown}."),
     )[:1]
@@ -194,8 +207,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     places = listed([effect.location for effect in alike])
     several = f"{kind} is significant at several locations (p below {level:.2g}): {places}."
     add = f"Add {kind} at {places} under model.effects (friction: as `yid-ocp friction` advises), and repeat "
-    longer = f"To try the rest, raise diagnosis.budget above {result.thresholds.budget} s."
-    limit = f"The time limit (diagnosis.budget: {result.thresholds.budget} s) ended the search. Not tried: "
+    limit = f"Not tried because of the time limit (diagnosis.budget: {result.thresholds.budget} s): "
     laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
     told = listed([event.text for event in events], max_entries=_MAX_NAMED)
@@ -203,7 +215,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
-    blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
+    blocks = "Every second block of time is held out (recordings.held_out: none). Only `yid-ocp solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
     divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
@@ -214,7 +226,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (result.unknown_reason, _reason(result)),
         (lost and tested, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
-        (result.untried, (f"{limit}{listed(result.untried)}.", longer)),
+        (result.untried, (f"{limit}{listed(result.untried)}.", _longer_search(result))),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
@@ -236,7 +248,8 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
-    more = f"Only {', '.join(kinds)} was tried. To try all effects, set diagnosis.candidates: all."
+    more = f"Only these kinds were tried: {', '.join(kinds)}. To try all effects, set diagnosis.candidates: all."
+    more *= len(kinds) <= _FEW_KINDS
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
     unlike = f"no tried effect resembles the error better than chance (p below {limits.significance_level:g})"
     failed = "every refit with an effect failed"
@@ -244,9 +257,9 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     none = _said((result.single_effect_models, tried), *causes)[0]
     few += "".join(_said((math.isfinite(closed), end)))
     why, advice = {
-        "none": (none, "".join(_said((len(kinds) <= _FEW_KINDS, more)))),
-        "little": (f"adding {names} explains only {few}", ""),
-        "stand_in": (f"the size of {unsure} is uncertain: {limit}{apart}", again),
+        "none": (none, more),
+        "little": (f"adding {names} explains only {few}", more),
+        "stand_in": (f"the size of {unsure} is uncertain: {limit}{apart}", f"{again} {more}".strip()),
     }.get(result.unknown_reason, ("", ""))
     return f"No cause is named, because {why}.", advice
 
@@ -298,8 +311,9 @@ def _remains(result: DiagnosisResult) -> list[str]:
     said = _said((is_left, large), (not is_left, noisy), (effects, size), (is_left and effects and places, mostly))
     changes = list[tuple[float, str]]()
     for name, own in result.nominal_parameters_before_and_after.items():
-        text = f"{name} from {own['before']:.3g} to {own['after']:.3g} {own['unit']}".removesuffix(" 1")
-        changes.append((abs(own["after"] - own["before"]) / max(abs(own["before"]), 1e-9), text))
-    ranked = sorted(changes, key=lambda own: -own[0])
-    moved = listed([text for change, text in ranked if change > _MIN_RELATIVE_CHANGE], max_entries=_MAX_NAMED)
+        now = value_and_uncertainty_text(own["after"], own["std"], least_digits=3)
+        text = f"{name} from {own['before']:.3g} to {now} {own['unit']}".removesuffix(" 1")
+        least = max(own["std"], _MIN_RELATIVE_CHANGE * abs(own["before"]), 1e-9)
+        changes.append((abs(own["after"] - own["before"]) / least, text))
+    moved = listed([text for change, text in sorted(changes, key=lambda own: -own[0]) if change > 1], _MAX_NAMED)
     return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]

@@ -476,10 +476,6 @@ def _alternatives(
     return drop, found
 
 
-_MIN_NAMED_SHARE = 0.1  # smallest share of the gap of a named location
-_MAX_NAMED_LOCATIONS = 3  # largest number of named locations
-
-
 @dataclass(frozen=True)
 class GapLocation:
     """A location of the gap in the model or a sensor, with its share of the gap, observability and time windows."""
@@ -489,11 +485,6 @@ class GapLocation:
     is_observable: bool  # whether the data would reveal a gap at this location
     time_windows: tuple[tuple[float, float], ...]  # times of the gap in any recording [s]
     indistinguishable_from: tuple[str, ...] = ()  # locations that the data cannot distinguish from this one
-
-
-def select_largest_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Return the first three locations in `where` with more than 10 % of the gap. If none has, return the first one."""
-    return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
 def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:

@@ -20,6 +20,7 @@ from yid_ocp.display import (
     unseen_effects_sentence,
 )
 from yid_ocp.effects import EFFECTS
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -41,8 +42,7 @@ from yid_ocp.report.terminal import (
     value_text_and_display_unit,
 )
 
-_MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # smallest listed share of the gap, and largest number of listed time windows
-_MAX_CANDIDATES = 15  # largest number of listed candidates; result.json has all
+_MAX_FORECASTS = 5  # largest number of listed candidates that were not fitted; result.json has all
 _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak", None)
 """Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
@@ -56,15 +56,16 @@ _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is nam
 
 @SUMMARIES.register("yid-diagnosis/2")
 def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    yield from issue_summary_blocks(result)
     verdict = result["verdict"].replace("_", " ")
     gap, *others = result["summary"].split("\n")
     is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
     head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe
     kinds = dict.fromkeys(own["kind"] for own in result.get("effects", ()) if own["kind"] in EFFECTS)
     meant = " ".join(f"{kind}: {(EFFECTS[kind].__doc__ or '').partition(chr(10))[0]}" for kind in kinds)
-    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), *others[-1:], meant
+    yield from issue_summary_blocks(result) if is_severe else ()
+    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), meant
     yield from (SummaryStatement(part, "verdict") for part in parts)
+    yield from () if is_severe else issue_summary_blocks(result)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
     added = (f"+ {step['added']}" for step in steps)
     rows: TableRows = [("channel", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
@@ -76,34 +77,24 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_computed = any(channel.startswith("joints.effort.") for channel in noise or ())
     said = "Noise alone of efforts includes that of the joint angles, from which the model computes torques."
     yield said if is_computed else ""
-    rows = [("location", "share", "times [s]")]
-    for place in result.get("where", ()):
-        if place["share"] > _MIN_GAP_SHARE:
-            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
-            more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
-            alike = " or ".join([place["location"], *place["indistinguishable_from"]])
-            rows.append((alike, f"{100 * place['share']:.1f} %", when + more))
-    yield SummaryTable(rows, "Where and when the error beyond noise arises")
     rows = [("channel", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "unit of the impulse")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
-    yield SummaryTable(rows, "Pushes and wrong samples")
+    yield SummaryTable(rows, "Pushes and wrong samples", is_page_only=True)
     fitted, untried = _candidate_rows(result)
     yield SummaryTable(fitted, "Effects that were fitted, and the part of the held-out error beyond noise each removes")
     possible = "Possible: not accepted yet, because another cause may explain the error as well."
     yield possible if any("possible" in row for row in fitted) else ""
     is_page_only = len(fitted) > 1 or verdict == "no gap"
     yield SummaryTable(untried, "Effects that were not fitted, with forecasts of their size", is_page_only=is_page_only)
-    yield "p-value: probability that noise alone resembles the effect as much." if verdict != "no gap" else ""
     yield "result.json has the p-values of all screened effects." if result["which"] else ""
-    unseen = result.get("unseen", ())
-    yield unseen_effects_sentence(unseen) if verdict != "no gap" else ""
+    yield unseen_effects_sentence(result.get("unseen", ())) if verdict != "no gap" else ""
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{', '.join(kinds)} ({_SIGNAL_TEXTS.get(signals, signals)})" for signals, kinds in missing]
-    yield f"Not tested, because no recording has the signals in brackets: {'; '.join(lacking)}." if lacking else ""
+    yield f"Not testable, because no recording has the signals in brackets: {'; '.join(lacking)}." if lacking else ""
     beside = " (with the effects)" if result.get("rival_changes", {}).get("parameters") else ""
     rows = [("parameter", "baseline", f"now{beside}", "unit", "change / its std", "verdict")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
@@ -119,6 +110,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors (rms) on recordings made without and with the effects")
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
+    yield from copyable_estimates_blocks(result)
+    yield from (SummaryStatement(step, "verdict") for step in others[-1:])
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         known = result["next_plan"].items()
@@ -126,18 +119,17 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         settings = (word for key, text in texts.items() for word in ("--set", f"plan.{key}={text}"))
         file = Path(texts["parameter_run_folder"]) / "config.yaml"
         yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
-    yield from copyable_estimates_blocks(result)
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     """Return table rows of the candidates that were fitted, and of the others with their forecasts."""
-    fitted: TableRows = [("effect", "parameters", "removed error", "p-value", "verdict")]
-    others: TableRows = [("effect", "forecast parameters", "p-value", "verdict")]
+    fitted: TableRows = [("effect", "parameters", "removed error", "p-value of noise alone", "verdict")]
+    others: TableRows = [("effect", "forecast parameters", "p-value of noise alone", "verdict")]
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
     added = {effect_entry_label(own): chosen for own in result.get("effects", ())}
     verdicts |= added
-    for entry in result["which"][:_MAX_CANDIDATES]:
+    for entry in result["which"]:
         values = []
         for name, own in entry["parameters"].items():
             unit, value = "" if own["unit"] == "1" else f" {own['unit']}", own["value"]
@@ -152,9 +144,9 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
             fitted.append((label, ", ".join(values), f"{100 * entry['closure']:.3g} %", *ends))
         elif label in added:
             fitted.append((label, ", ".join(values), "fitted beside others only", *ends))
-        else:
+        elif label in verdicts or entry["p_value"] < DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level:
             others.append((label, ", ".join(values), *ends))
-    return fitted, others
+    return fitted, others[: 1 + _MAX_FORECASTS]
 
 
 @SUMMARIES.register("yid-blind/1")
@@ -418,12 +410,14 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
     text = f"Use the law '{best}' for these joints: {joints}. Its"
-    if is_absent := bool(friction) and all(shown[name] == "–" for name in friction):
+    is_absent = bool(friction) and all(shown[name] == "–" for name in friction)
+    if not chosen["converged"]:
+        text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge. Its"
+    elif is_absent:
         text = f"Use no friction law, because these recordings do not show friction of {joints}. Of '{best}', the"
     text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law whose error exceeds "
     text += f"the smallest one by no more than chance allows. Each motion was held out in turn: {kinds}."
-    failed = " Do not use its values below, because its fit did not converge." * (not chosen["converged"])
-    yield SummaryStatement(text + failed, "conclusion")
+    yield SummaryStatement(text, "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
     symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
@@ -441,7 +435,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
-    if not result["to_use"] and not is_absent:
+    if chosen["converged"] and not result["to_use"] and not is_absent:
+        yield "For a configuration of yid-ocp (the law without values):"
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
     yield from copyable_estimates_blocks(result)
 
