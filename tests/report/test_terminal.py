@@ -263,11 +263,12 @@ def test_tables_are_aligned_without_empty_columns():
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     parameters = {"tau": {"value": 0.05, "std": None, "unit": "s"}}
     entry = {"kind": "kelvin_voigt", "location": "T1", "closure": None, "parameters": parameters}
-    which = [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}]
+    which = [entry | {"location": at, "p_value": p} for at, p in (("T1", 0.0), ("T2", 0.0034), ("T3", 0.5))]
     known = {"summary": "There is a gap.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
     result = known | {"gap": {"before": {"rmse": {}, "unit": {}}}, "which": which}
     lines = told("yid-diagnosis/2", result)
-    assert [line_of(lines, f"kelvin_voigt@{at}")[-7:] for at in ("T1", "T2")] == ["< 1e-12", "  0.034"]
+    assert [line_of(lines, f"kelvin_voigt@{at}")[-7:].strip() for at in ("T1", "T2")] == ["< 1e-12", "0.0034"]
+    assert not any("kelvin_voigt@T3" in line for line in lines)
     unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
     lines = told("yid-diagnosis/2", result | {"unseen": unseen})
     at = next(i for i, line in enumerate(lines) if "would not show" in line)
@@ -276,7 +277,7 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     refitted, named = (told("yid-diagnosis/2", result | alike | {"verdict": own}) for own in ("confusable", "effect"))
     assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
     beside = told("yid-diagnosis/2", result | {"effects": which[1:], "verdict": "effect"})
-    assert "fitted beside others only  0.034    accepted" in line_of(beside, "kelvin_voigt@T2")
+    assert "fitted beside others only  0.0034  " in line_of(beside, "kelvin_voigt@T2")
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
