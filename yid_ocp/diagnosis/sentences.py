@@ -158,10 +158,8 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
     groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
     words = {group: f"the readings of {group}" for group in groups}
-    alike = ([p.location, *p.indistinguishable_from] for p in where)
-    texts = [" or ".join(words.get(place, place) for place in places) for places in alike]
-    parts = [(place.gap_share, text) for place, text in zip(where, texts, strict=True)]
-    named = [f"{place} ({100 * part:.0f} %)" for part, place in parts]
+    alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
+    named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
