@@ -134,7 +134,10 @@ def costing(cost: float, rows: int) -> Evaluation:
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
-    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system, held_out=())
+    options = SimpleNamespace(divided_links_model=None)
+    return SimpleNamespace(
+        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
+    )
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:

@@ -203,21 +203,21 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "No recording could be held out (recordings.held_out), so every second block of time is held out."
     links = "The model has too few links. The resulting error is not part of these numbers."
-    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
+    divided = result.nominal_model.problem.options.divided_links_model
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
     rows = [
         (result.unknown_reason, _reason(result)),
-        (lost and tested, (other_channels, f"Hold out a recording that has {lost}, too.")),
+        (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
         (result.untried, (f"{limit}{listed(result.untried)}.", longer)),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (events, (left_out, check)),
-        (divided, (links, f"For other commands, set {divided and divided.setting_text}.")),
+        (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),
     ]
     return [text for holds, text in rows if holds]
 
