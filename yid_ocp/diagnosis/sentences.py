@@ -168,19 +168,21 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on where a gap lies, on the selected effects, and on the error that is left."""
-    added, limits = result.selected_effects, result.thresholds
-    names, total = listed([entry.effect.label for entry in added]), result.closure_by_selected_effects
+    added, where = result.selected_effects, gap_locations_sentence(result, has_origin=True)
+    if not added:
+        return [where, *_remains(result)]
+    names, total = listed([entry.effect.label for entry in added]), added[-1].cumulative_closure
     removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
     interval = f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)"
     unknown = f"{removed} an unknown part {of}"
     is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
     closed = _said(
-        (added and math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
-        (added and is_within, f"{unknown}, because the nominal model's error there is within noise."),
-        (added, f"{unknown}."),
-    )[:1]
-    sizes = [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
-    return [gap_locations_sentence(result, has_origin=True), *closed, *sizes, *_remains(result)]
+        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of} {interval}."),
+        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
+        (True, f"{unknown}."),
+    )[0]
+    sizes = [_named(entry.effect, added[-1].refitted_model, result.thresholds) for entry in added]
+    return [where, closed, *sizes, *_remains(result)]
 
 
 def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:

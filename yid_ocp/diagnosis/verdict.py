@@ -93,11 +93,6 @@ class Judgement:
     rival_probability: float  # that these shifts are the cause
 
     @property
-    def closure_by_selected_effects(self) -> null_test.HeldOutGapClosure:
-        """The fraction of the gap that all selected effects close together. Undefined without effects."""
-        return total_gap_closure(self.selected_effects)
-
-    @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
@@ -126,7 +121,7 @@ class Judgement:
         """
         effects = (entry.effect for entry in self.selected_effects)
         count = len({effect.label if effect.is_local else effect.kind for effect in effects})
-        closed = self.closure_by_selected_effects.ci_low
+        closed = total_gap_closure(self.selected_effects).ci_low
         pairs = (self.explained_fraction, limits.min_explained_fraction), (closed, limits.min_closure)
         fitted, held_out = ((part, 1.0 - (1.0 - least) ** count) for part, least in pairs)
         return fitted, held_out
