@@ -204,10 +204,7 @@ def select_effects(
         later += [fit.statistics() for fit in fits]
         near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before, rivals)
-    if len(chosen.effects) == 1:
-        best = chosen.effects[0].label
-        single[best] = chosen  # it may differ from the first fit
-    known = {join_effect_labels(fit.effects): fit for fit in (*single.values(), chosen)}
+    known = single | {join_effect_labels(chosen.effects): chosen}  # it may differ from the first fit
     added = []
     for i, effect in enumerate(chosen.effects, 1):
         name = join_effect_labels(chosen.effects[:i])
@@ -215,7 +212,9 @@ def select_effects(
         closed = null_test.held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
         added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
-    return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)
+    alone = [fit for fit in known.values() if len(fit.effects) == 1]
+    alone.sort(key=lambda fit: (fit is not chosen, fit.effects[0].label != best, _chi2(fit)))
+    return tuple(alone), tuple(added)
 
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:
