@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,8 +37,6 @@ class SelectedEffect:
     cumulative_closure: null_test.HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
-    # by effect parameter: std of what further effects, in the gap that is left, may contribute to its value
-    model_error_std: dict[str, float] = field(default_factory=dict)
 
 
 def total_gap_closure(entries: Sequence[SelectedEffect]) -> null_test.HeldOutGapClosure:
@@ -159,12 +157,13 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
 
 def select_effects(
     search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
-) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
+) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...], dict[str, float]]:
     """Add effects one by one to close the held-out gap, then try to replace and remove each of them.
 
     If `moved` (the nominal fit has left the estimates of an earlier run), candidates are also tried from those
-    estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
-    effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
+    estimates. Returns the fits of single effects in the first round, the selected effects, and by effect parameter the
+    std of what further effects may contribute to it. The fit of the chosen effect comes first (its last fit if no other
+    effect is selected), then all other fits by held-out loss.
     """
     limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
@@ -211,10 +210,10 @@ def select_effects(
         fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
         closed = null_test.held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
-        added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
+        added.append(SelectedEffect(effect, fit, closed, *same))
     alone = [fit for fit in known.values() if len(fit.effects) == 1]
     alone.sort(key=lambda fit: (fit is not chosen, fit.effects[0].label != best, _chi2(fit)))
-    return tuple(alone), tuple(added)
+    return tuple(alone), tuple(added), _model_error_std(chosen, later, limits)
 
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:

@@ -133,14 +133,14 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
+    fits, added, beside = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...](), dict[str, float]()
     if evidence.warrants_effect_search(limits):
-        fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
+        fits, added, beside = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     search.record_stage_end_time("refits")
 
     carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
     if added:
-        last, beside = added[-1].refitted_model, added[-1].model_error_std
+        last = added[-1].refitted_model
         explained = _explained_fraction(nominal, last, limits)
         carried = _check_effect_amplitude_transfer(search, last)
         apart = {own.parameter: own.significant_disagreement_as_std for own in carried}
