@@ -18,7 +18,6 @@ from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     EMPTY_SCREENING_RESULT,
     CandidateDetectability,
-    ProjectedCandidatesLinearization,
     ScoreTestResult,
     ScreeningResult,
     _EffectSignature,
@@ -79,8 +78,9 @@ def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) 
     return _EffectSignature(of, named, *made)
 
 
-def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLinearization:
-    return ProjectedCandidatesLinearization(np.asarray(residual, float), signatures)
+def point(residual, *signatures: _EffectSignature):
+    """What `linearize_candidates` returns."""
+    return np.asarray(residual, float), list(signatures)
 
 
 def screened(at, channels=(), detectable_at=module.DETECTABLE_AMPLITUDE_Z) -> ScreeningResult:

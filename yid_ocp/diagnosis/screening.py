@@ -50,14 +50,6 @@ class _EffectSignature:
 
 
 @dataclass(frozen=True)
-class ProjectedCandidatesLinearization:
-    """The linearised residual and candidate signatures, without the part that the model's free parameters explain."""
-
-    projected_residual: Array  # P r, shape (nr,)
-    signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
-
-
-@dataclass(frozen=True)
 class CandidateDetectability:
     """The smallest amplitudes of a candidate that are detectable, given its sensitivity and the noise."""
 
@@ -87,16 +79,17 @@ def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[s
 
 def linearize_candidates(
     problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
-) -> ProjectedCandidatesLinearization:
+) -> tuple[Array, list[_EffectSignature]]:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
-    model. Raises `SolverError` if the rollout at `values` fails.
+    model. Returns P r, shape (nr,), and a signature for each candidate and grid value, both without the part that the
+    free parameters explain. Raises `SolverError` if the rollout at `values` fails.
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     if not tried:
-        return ProjectedCandidatesLinearization(np.zeros(0), ())
+        return np.zeros(0), []
     placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     x = placed.pack_unknowns(values)
@@ -154,7 +147,7 @@ def linearize_candidates(
             pairs = [*zip(shifted, errors, strict=False)]
             of_score = _covariance_and_bias_of_score(problem.problem, series, columns, scatter, pairs)
             signatures.append(_EffectSignature(effect, shape, columns, *of_score, changes))
-    return ProjectedCandidatesLinearization(residual, tuple(signatures))
+    return residual, signatures
 
 
 def _covariance_and_bias_of_score(
@@ -322,9 +315,9 @@ def screen_candidates(
     problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
 ) -> ScreeningResult:
     """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
-    point = linearize_candidates(problem, base, values)
-    series, residual = channels_with_residual_indices(problem.problem), point.projected_residual
-    grids = grouped((own.effect.label, own) for own in point.signatures)
+    residual, signatures = linearize_candidates(problem, base, values)
+    series = channels_with_residual_indices(problem.problem)
+    grids = grouped((own.effect.label, own) for own in signatures)
     visible, scores, kept = list[CandidateDetectability](), list[ScoreTestResult](), list[_EffectSignature]()
     for grid in grids.values():
         # the smallest amplitude that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
