@@ -345,10 +345,8 @@ def changes_by_candidates_at_location(
     It is the candidate with the largest predicted decrease of r'r whose p-value is below `level`. Effects without one
     are left out.
     """
-    names, found = [name for effect in base for name in effect.parameters.names], dict[str, float]()
-    for effect in base:
-        alike = (s for s in screened.candidate_scores if s.effect.location == effect.location and s.p_value < level)
-        if best := next(alike, None):
-            changes = dict(zip(names, best.base_changes, strict=True))
-            found |= {name: changes[name] for name in effect.parameters.names}
-    return found
+    names = [name for effect in base for name in effect.parameters.names]
+    significant = grouped((s.effect.location, s) for s in screened.candidate_scores if s.p_value < level)
+    best = {place: dict(zip(names, own[0].base_changes, strict=True)) for place, own in significant.items()}
+    changed = [effect for effect in base if effect.location in best]
+    return {name: best[effect.location][name] for effect in changed for name in effect.parameters.names}
