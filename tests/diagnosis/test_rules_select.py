@@ -572,7 +572,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted(monkeypatch):
         return select._pairs_to_refit(search, found, kinds["a"])
 
     chosen = to_refit(3)
-    assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]
+    assert asked == [{"b@x", "c@x", "d@x", "e@x", "f@x"}]
     assert ["".join(of.kind for of in pair) for pair, _ in chosen] == ["bc", "ef", "bd"]
     assert to_refit(0) == []
 

@@ -201,7 +201,7 @@ class RefitContext:
 
     def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
-        labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
+        labels = {score.effect.label for score in screened.candidate_scores} - {without}
         ranked = screened.rank_candidate_pairs
         return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
 

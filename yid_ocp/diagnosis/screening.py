@@ -13,7 +13,7 @@ has the derivation.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -202,8 +202,9 @@ def _pinv(matrix: Array) -> Array:
 
 def _room(effect: EffectBase) -> Array:
     """Largest changes of amplitudes from neutral, downwards and upwards, shape (2, p)."""
-    own = [q for q in effect.definitions if not q.is_shape_parameter]
-    return np.array([[q.lower - q.neutral_value for q in own], [q.upper - q.neutral_value for q in own]])
+    neutral, bounds = effect.neutral_values, effect.parameters
+    ends = [(bounds[n].lower - neutral[n], bounds[n].upper - neutral[n]) for n in effect.amplitude_parameter_names]
+    return np.array(ends).T
 
 
 def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, float]:
@@ -290,7 +291,7 @@ class ScreeningResult:
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
-    def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
+    def rank_candidate_pairs(self, among: Collection[str]) -> list[ScoredCandidatePair]:
         """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
