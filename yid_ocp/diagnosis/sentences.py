@@ -104,7 +104,7 @@ def _lead(result: DiagnosisResult) -> str:
     since = f"With {100 * result.rival_probability:.0f} % probability, no effect is missing, but parameters have "
     since += f"changed since the baseline: {moved}."
     shares = sorted([(result.probability, probable), (result.rival_probability, since)], reverse=True)
-    probable = " ".join(text for share, text in shares if share)
+    probable = " ".join(_said(*shares))
     none = f"Use the model for motions like these. There is no relevant gap: {sizes}, {chance}. The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
@@ -210,7 +210,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
-    rows = [
+    return _said(
         (result.unknown_reason, _reason(result)),
         (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
@@ -220,8 +220,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (result.is_split_in_blocks, (blocks, "")),
         (events, (left_out, check)),
         (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),
-    ]
-    return [text for holds, text in rows if holds]
+    )
 
 
 def _reason(result: DiagnosisResult) -> tuple[str, str]:
