@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -218,12 +219,12 @@ def select_effects(
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:
     """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
-    chosen, most = list[EffectsWithStart](), search.thresholds.signature_overlap
+    chosen, known, most = list[EffectsWithStart](), set[tuple[str, ...]](), search.thresholds.signature_overlap
     for pair, values, _ in search.rank_candidate_pairs(screened, without.label):
-        one, other = ({own.label, *screened.candidates_confusable_with(own.label, most)} for own in pair)
-        before = [order for known, _ in chosen for order in (known, known[::-1])]
-        if not any(a.label in one and b.label in other for a, b in before):
+        alike = ({own.label, *screened.candidates_confusable_with(own.label, most)} for own in pair)
+        if known.isdisjoint(itertools.product(*alike)):
             chosen.append((pair, values))
+            known.update(itertools.permutations(own.label for own in pair))
     return chosen[: search.thresholds.n_refit_pairs]
 
 
