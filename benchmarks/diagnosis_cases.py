@@ -248,6 +248,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
         for a in finding.selected_effects
         if len(a.equivalent_effects) > 1
     )
+    closed = [100 * entry.cumulative_closure.fraction for entry in finding.accepted_selected_effects]
     judged = "-" if case.verdict == "-" else "yes" if right(case, finding) else "no"
     return {
         "case": name,
@@ -267,7 +268,7 @@ def run(name: str, seeds: Sequence[int], record: str = "") -> dict[str, str]:
         else "-",
         "chi2/n held out": f"{finding.nominal_held_out_test.chi2_per_dof:.3g}",
         "with the truth": "-" if math.isnan(best) else f"{best:.3g}",
-        "closure": f"{100 * finding.closure_by_selected_effects.fraction:.0f} %" if finding.accepted_effects else "-",
+        "closure": f"{closed[-1]:.0f} %" if closed else "-",
         "time": f"{seconds:.0f} s",
     }
 

@@ -54,8 +54,8 @@ def count_with_noun(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def texts_that_hold(*rows: tuple[object, str]) -> list[str]:
-    """Return the texts whose condition holds, or is not empty."""
+def texts_that_hold(*rows: tuple[object, _Value]) -> list[_Value]:
+    """Return the texts (or tuples of texts) whose condition holds, or is not empty."""
     return [text for holds, text in rows if holds]
 
 

@@ -18,7 +18,6 @@ from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     EMPTY_SCREENING_RESULT,
     CandidateDetectability,
-    ProjectedCandidatesLinearization,
     ScoreTestResult,
     ScreeningResult,
     _EffectSignature,
@@ -79,8 +78,9 @@ def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) 
     return _EffectSignature(of, named, *made)
 
 
-def point(residual, *signatures: _EffectSignature) -> ProjectedCandidatesLinearization:
-    return ProjectedCandidatesLinearization(np.asarray(residual, float), signatures)
+def point(residual, *signatures: _EffectSignature):
+    """What `linearize_candidates` returns."""
+    return np.asarray(residual, float), list(signatures)
 
 
 def screened(at, channels=(), detectable_at=module.DETECTABLE_AMPLITUDE_Z) -> ScreeningResult:
@@ -134,7 +134,10 @@ def costing(cost: float, rows: int) -> Evaluation:
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
-    return SimpleNamespace(has_process_noise=False, shared_parameters=names, system=system, held_out=())
+    options = SimpleNamespace(divided_links_model=None)
+    return SimpleNamespace(
+        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
+    )
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:

@@ -76,7 +76,7 @@ def test_a_spring_is_found_at_a_wrist():
     assert finding.verdict in ("effect", "confusable")
     assert finding.accepted_effects[0].label == "joint_spring@right_w1"
     assert finding.gap_locations[0].location == "right_w1"
-    assert finding.closure_by_selected_effects.fraction > 0.95
+    assert finding.selected_effects[-1].cumulative_closure.fraction > 0.95
     fit = finding.final_model
     found = finding.accepted_effects[0].to_reported_parameters(fit.values, fit.std)
     assert found["stiffness"].value == pytest.approx(3.0, rel=0.05)

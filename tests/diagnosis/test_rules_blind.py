@@ -123,7 +123,7 @@ def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     composed = SimpleNamespace(with_whitening_linearized_at=lambda at: whitened if at is truth else None)
 
     def linearized(of, base, values):
-        return SimpleNamespace(signatures=[signature(DAMPER, [[2.0]])] if (of, values) == (whitened, truth) else [])
+        return None, [signature(DAMPER, [[2.0]])] if (of, values) == (whitened, truth) else []
 
     monkeypatch.setattr(module, "EstimationProblem", lambda *_: problem())
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))

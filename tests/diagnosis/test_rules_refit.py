@@ -43,7 +43,7 @@ class Problem:
         self.cost, self.rows, self.unknown_names = cost, rows, names
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters, self.has_process_noise = None, (), False
-        self.step, self.held_out_spread, self.refit_solver = SimpleNamespace(time_step=0.01), np.zeros((0, 0)), None
+        self.step, self.held_out_spread = SimpleNamespace(time_step=0.01), np.zeros((0, 0))
 
     @property
     def problem(self):
@@ -106,7 +106,7 @@ def solved(monkeypatch):
         made.losses.append(problem.named_values(x))
         return loss(1.5, 1.6)
 
-    monkeypatch.setattr(module, "REFIT_SOLVER", SimpleNamespace(minimize_cost=run))
+    monkeypatch.setattr(Problem, "refit_solver", SimpleNamespace(minimize_cost=run), raising=False)
     monkeypatch.setattr(module.null_test, "held_out_loss", held_out)
     monkeypatch.setattr(module, "noise_only_covariance_sqrt", lambda problem, evaluation: evaluation)
     monkeypatch.setattr(

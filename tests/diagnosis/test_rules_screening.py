@@ -30,7 +30,7 @@ SHAPED = effect("branch@T1", amplitude(), shape())
 
 def scored(at, rows=None):
     """The scores of candidates, all of them visible."""
-    return screened(at, [series(rows or range(len(at.projected_residual)))], detectable_at=0.0).candidate_scores
+    return screened(at, [series(rows or range(len(at[0])))], detectable_at=0.0).candidate_scores
 
 
 def only(of, columns, residual, noise=None, **shapes):
@@ -121,9 +121,9 @@ def test_noise_that_moves_an_arm_and_predicts_its_efforts_biases_no_score(kind, 
         own = replace(smooth, joints=replace(group, **noisy, effort_std=0.01))
         made = EstimationProblem(step, [own], problem.free, options)
         made = AllCandidatesProblem.from_problem(made, [make_effect(kind, place, step.system)])
-        found = linearize_candidates(made, (), {"joint.damping": 0.05})
-        [signature], [score] = found.signatures, screen_candidates(made, (), {"joint.damping": 0.05}).candidate_scores
-        raw = (signature.projected_sensitivity.T @ found.projected_residual).item()
+        residual, [signature] = linearize_candidates(made, (), {"joint.damping": 0.05})
+        [score] = screen_candidates(made, (), {"joint.damping": 0.05}).candidate_scores
+        raw = (signature.projected_sensitivity.T @ residual).item()
         z.append([part / signature.score_noise_covariance.item() ** 0.5 for part in (raw, signature.score_bias.item())])
         p_values.append(score.p_value)
     raw, bias = np.mean(z, axis=0)

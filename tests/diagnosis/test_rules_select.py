@@ -274,7 +274,7 @@ class Rounds:
         self.thresholds, self.is_late = Thresholds(**limits), is_late
         problem = SimpleNamespace(has_process_noise=self.noisy)
         nominal = fit((), loss(*self.losses[""]), self.cost, {"k": 0.0}, problem=problem)
-        first, added = select.select_effects(self, nominal, self.screened(), moved=moved)
+        first, added, self.model_error_std = select.select_effects(self, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 
@@ -376,8 +376,8 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 
 
 def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it(monkeypatch):
-    _, chosen, found = Rounds(monkeypatch, GROWING).compose(max_effects=1)
-    assert (chosen, found[0].model_error_std) == (["a"], {"a@x.a": 0.0})
+    rounds = Rounds(monkeypatch, GROWING)
+    assert (rounds.compose(max_effects=1)[1], rounds.model_error_std) == (["a"], {"a@x.a": 0.0})
     moved = {"ab": 1.3, "ac": 0.6, "bc": 9.0, "abc": 9.0}
 
     def unsure(**losses):
@@ -389,7 +389,8 @@ def test_where_a_gap_is_left_an_estimate_is_as_unsure_as_further_effects_make_it
             return replace(made, values=made.values | {"a@x.a": moved.get(kinds, 1.0)})
 
         monkeypatch.setattr(rounds, "fit", elsewhere)
-        return rounds.compose(max_effects=2)[2][0].model_error_std
+        rounds.compose(max_effects=2)
+        return rounds.model_error_std
 
     assert unsure() == {"a@x.a": pytest.approx(math.sqrt(0.125))}
     assert unsure(a=(1.0, 1.0)) == {}, "what leaves only noise"
@@ -571,7 +572,7 @@ def test_pairs_that_others_can_stand_in_for_are_not_refitted(monkeypatch):
         return select._pairs_to_refit(search, found, kinds["a"])
 
     chosen = to_refit(3)
-    assert asked == [["b@x", "c@x", "d@x", "e@x", "f@x"]]
+    assert asked == [{"b@x", "c@x", "d@x", "e@x", "f@x"}]
     assert ["".join(of.kind for of in pair) for pair, _ in chosen] == ["bc", "ef", "bd"]
     assert to_refit(0) == []
 

@@ -30,12 +30,12 @@ def explaining(part, effects, **more):
     return replace(made, cost=100.0 - (100.0 * part + made.total_effect_parameter_count) / 2, residual_count=100)
 
 
-def judgement(chosen, again=None, *, nominal=NOMINAL, gap=True, enough=True, search=None):
+def judgement(chosen, again=None, *, nominal=NOMINAL, gap=True, enough=True, search=None, beside=()):
     """What is said of chosen effects; `again` is the refit on the held-out recordings."""
     search = search or Mock(thresholds=LIMITS, refit_on_held_out=Mock(return_value=again))
     evidence = Mock(nominal_model=nominal, residual_exceeds_noise=Mock(return_value=gap), are_data_sufficient=enough)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verdict_module, "select_effects", lambda *_: ((), tuple(chosen)))
+        patch.setattr(verdict_module, "select_effects", lambda *_: ((), tuple(chosen), dict(beside)))
         return judge(search, evidence)
 
 
@@ -302,9 +302,8 @@ def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(firs
 @pytest.mark.parametrize(("there", "std"), [(None, 0.4), (2.1, 0.4), (3.0, math.sqrt(0.5))])
 def test_an_estimate_is_as_unsure_as_further_effects_and_other_recordings_make_it(there, std):
     first = explaining(0.6, [SPRING], values={"spring@elbow.k": 2.0, "spring@elbow.s": 3.0})
-    entry = replace(added(SPRING, fitted=first), model_error_std={"spring@elbow.k": 0.4})
     again = None if there is None else fit([SPRING], values=first.values | {"spring@elbow.k": there})
-    [found] = judgement((entry,), again).selected_effects
+    [found] = judgement((added(SPRING, fitted=first),), again, beside={"spring@elbow.k": 0.4}).selected_effects
     assert found.refitted_model.std == {"spring@elbow.k": pytest.approx(std), "spring@elbow.s": 0.01}
 
 

@@ -15,12 +15,7 @@ from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.pulse_detection import CompiledInverseDynamics
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import (
-    ProjectedCandidatesLinearization,
-    changes_by_candidates_at_location,
-    linearize_candidates,
-    screen_candidates,
-)
+from yid_ocp.diagnosis.screening import changes_by_candidates_at_location, linearize_candidates, screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
 
@@ -86,10 +81,11 @@ def test_an_effect_changes_as_forecast_if_the_best_candidate_at_its_location_is_
 
 def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_the_rest(screened):
     _, nominal, point = screened
-    jacobian = nominal.evaluation.jacobian[: len(point.projected_residual)]
+    residual, signatures = point
+    jacobian = nominal.evaluation.jacobian[: len(residual)]
     size = np.linalg.norm(jacobian, axis=0)
-    assert np.abs(jacobian.T @ point.projected_residual / size).max() < 1e-8 * np.linalg.norm(point.projected_residual)
-    for signature in point.signatures:
+    assert np.abs(jacobian.T @ residual / size).max() < 1e-8 * np.linalg.norm(residual)
+    for signature in signatures:
         leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
         assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
     # a candidate explains itself, and nothing explains more
@@ -100,9 +96,9 @@ def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_t
 
 
 def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
-    _, _, point = screened
-    still = ProjectedCandidatesLinearization(0 * point.projected_residual, point.signatures)
-    sizes, silent = ([v.detectable_amplitudes for v in screened_at(at).detectability] for at in (point, still))
+    _, _, (residual, signatures) = screened
+    points = ((residual, signatures), (0 * residual, signatures))
+    sizes, silent = ([v.detectable_amplitudes for v in screened_at(at).detectability] for at in points)
     assert sizes == silent
     coulomb = next(size["joint_coulomb@elbow.tau_c"] for size in sizes if "joint_coulomb@elbow.tau_c" in size)
     assert 0 < coulomb < 0.1
@@ -124,8 +120,8 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     # the more it leans towards the residual, the more of it the second one explains
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
-    at = made_point(residual[:, 0], *(made_signature(effect, x) for x in columns))
-    at = replace(at, signatures=tuple(replace(s, shape_values=own) for s, own in zip(at.signatures, grid, strict=True)))
+    made = (made_signature(effect, x) for x in columns)
+    at = made_point(residual[:, 0], *(replace(s, shape_values=own) for s, own in zip(made, grid, strict=True)))
     best = screened_at(at, [series(range(200))]).candidate_scores[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 

@@ -16,8 +16,8 @@ import scipy.special
 
 from yid_ocp.analysis.run_estimates import RunEstimates, nearby_positive_definite_covariance, pool_estimates_and_chi2
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel
+from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, neutral_effect_parameter_values
+from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress, texts_that_hold
 from yid_ocp.display import abbreviated_names_text as listed

@@ -295,10 +295,9 @@ class BlindCaseGenerator:
         problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [held_out])
-        point = linearize_candidates(composed.with_whitening_linearized_at(truth), (), truth)
+        _, signatures = linearize_candidates(composed.with_whitening_linearized_at(truth), (), truth)
         return [
-            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
-            for s in point.signatures
+            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r"))) for s in signatures
         ]
 
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:

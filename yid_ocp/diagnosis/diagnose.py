@@ -21,10 +21,9 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, find_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
+from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
 from yid_ocp.diagnosis.refit import (
     NO_REFIT_STORE,
-    REFIT_SOLVER,
     EffectSearchRecord,
     RefitContext,
     RefitStore,
@@ -65,7 +64,7 @@ def diagnose(
     store: RefitStore = NO_REFIT_STORE,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
-    refit_solver: GaussNewton | None = None,
+    refit_solver: GaussNewton = REFIT_SOLVER,
 ) -> DiagnosisResult:
     """Diagnose the gap between model and recordings: find out whether it exists, where it is, and what causes it.
 
@@ -90,7 +89,7 @@ def diagnose(
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
         them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
         the sought effects, which are predicted with the found effects removed.
-    refit_solver : GaussNewton, optional
+    refit_solver : GaussNewton
         Solver of all refits, for example with looser tolerances if model error dominates the cost.
 
     Returns

@@ -175,17 +175,15 @@ def _errors_to_dict(fit: RefitStatistics) -> dict[str, Any]:
 def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list[dict[str, Any]]:
     """All candidates: accepted effects, then other refits by held-out loss, then the rest by p-value."""
     added, alone = judged.accepted_selected_effects, judged.single_effect_models
-    before, last = seen.nominal_model.held_out_loss, [entry.refitted_model for entry in added[-1:]]
+    before = seen.nominal_model.held_out_loss
     closures = {fit.effects[0].label: null_test.held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     tried = sorted(scores.values(), key=lambda score: score.p_value)
     pairs = (pair for e in judged.selected_effects for pair in zip(e.equivalent_effects, e.shares, strict=True))
     shares = {effect.label: share for effect, share in pairs}
-    found = [
-        *((e.effect, e.effect.to_reported_parameters(fit.values, fit.std)) for e in added for fit in last),
-        *((fit.effects[0], fit.effects[0].to_reported_parameters(fit.values, fit.std)) for fit in alone),
-        *((s.effect, s.effect.to_reported_parameters(s.predicted_values)) for s in tried),
-    ]
+    fitted = [*((e.effect, added[-1].refitted_model) for e in added), *((fit.effects[0], fit) for fit in alone)]
+    found = [(effect, effect.to_reported_parameters(fit.values, fit.std)) for effect, fit in fitted]
+    found += [(s.effect, s.effect.to_reported_parameters(s.predicted_values)) for s in tried]
     listed: dict[str, dict[str, Any]] = {}
     for effect, reported in found:
         score = scores.get(effect.label, ScoreTestResult(effect, {}, 0.0, 0.0, 1.0))

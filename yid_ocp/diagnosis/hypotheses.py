@@ -34,6 +34,7 @@ from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.solvers import GaussNewton
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
+REFIT_SOLVER = GaussNewton(max_iterations=25).with_coarse_tolerances  # good to a part of a std
 
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
@@ -143,7 +144,7 @@ class AllCandidatesProblem:
     is_split_in_blocks: bool  # whether alternate blocks of the estimation recordings are held out, without other ones
     # functions of the nominal system with some candidates, by their labels and the time step [s]
     functions_of_some: CasadiLockedCache[tuple[tuple[str, ...], float], ModelFunctions] | None = None
-    refit_solver: GaussNewton | None = None  # of all refits; default: that of `refit`
+    refit_solver: GaussNewton = REFIT_SOLVER  # of all refits
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
     # of screenings that share them, by point of the shape grid: changes of residual and, by unknown, Jacobian (n,)
     changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] = field(default_factory=dict)

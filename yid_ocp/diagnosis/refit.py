@@ -24,11 +24,10 @@ from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_
 from yid_ocp.parallel import map_in_threads, map_with_merged_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.solvers import GaussNewton, Status
+from yid_ocp.solvers import Status
 from yid_ocp.solvers.base import SolverResult
 
 _SECANT_STDS = 0.4  # half the length of secants, in stds of the unknowns: longer than the steps of a rough cost
-REFIT_SOLVER = GaussNewton(max_iterations=25).with_coarse_tolerances  # good to a part of a std
 _Answer = TypeVar("_Answer")
 _UNINFORMATIVE_STD_RATIO = 100.0  # std over prior range from which a parameter counts as not informed
 _MAX_RECORDED_PAIRS = 48  # of candidates; all further pairs predict a smaller decrease than the refitted pairs
@@ -202,7 +201,7 @@ class RefitContext:
 
     def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
-        labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without]
+        labels = {score.effect.label for score in screened.candidate_scores} - {without}
         ranked = screened.rank_candidate_pairs
         return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
 
@@ -286,7 +285,7 @@ def _model(
 
 def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt:
     """One run from one start; its evaluation is not `ok` if the model cannot be rolled out."""
-    neutral, solver = neutral_effect_parameter_values(effects), problem.refit_solver or REFIT_SOLVER
+    neutral, solver = neutral_effect_parameter_values(effects), problem.refit_solver
     own = problem.problem_with_effects_and_relinearized_filters(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}

@@ -13,7 +13,7 @@ has the derivation.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,14 +50,6 @@ class _EffectSignature:
 
 
 @dataclass(frozen=True)
-class ProjectedCandidatesLinearization:
-    """The linearised residual and candidate signatures, without the part that the model's free parameters explain."""
-
-    projected_residual: Array  # P r, shape (nr,)
-    signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
-
-
-@dataclass(frozen=True)
 class CandidateDetectability:
     """The smallest amplitudes of a candidate that are detectable, given its sensitivity and the noise."""
 
@@ -87,16 +79,17 @@ def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[s
 
 def linearize_candidates(
     problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
-) -> ProjectedCandidatesLinearization:
+) -> tuple[Array, list[_EffectSignature]]:
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
-    model. Raises `SolverError` if the rollout at `values` fails.
+    model. Returns P r, shape (nr,), and a signature for each candidate and grid value, both without the part that the
+    free parameters explain. Raises `SolverError` if the rollout at `values` fails.
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]
     if not tried:
-        return ProjectedCandidatesLinearization(np.zeros(0), ())
+        return np.zeros(0), []
     placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     x = placed.pack_unknowns(values)
@@ -154,7 +147,7 @@ def linearize_candidates(
             pairs = [*zip(shifted, errors, strict=False)]
             of_score = _covariance_and_bias_of_score(problem.problem, series, columns, scatter, pairs)
             signatures.append(_EffectSignature(effect, shape, columns, *of_score, changes))
-    return ProjectedCandidatesLinearization(residual, tuple(signatures))
+    return residual, signatures
 
 
 def _covariance_and_bias_of_score(
@@ -209,8 +202,9 @@ def _pinv(matrix: Array) -> Array:
 
 def _room(effect: EffectBase) -> Array:
     """Largest changes of amplitudes from neutral, downwards and upwards, shape (2, p)."""
-    own = [q for q in effect.definitions if not q.is_shape_parameter]
-    return np.array([[q.lower - q.neutral_value for q in own], [q.upper - q.neutral_value for q in own]])
+    neutral, bounds = effect.neutral_values, effect.parameters
+    ends = [(bounds[n].lower - neutral[n], bounds[n].upper - neutral[n]) for n in effect.amplitude_parameter_names]
+    return np.array(ends).T
 
 
 def _promised(information: Array, slope: Array, room: Array) -> tuple[Array, float]:
@@ -297,7 +291,7 @@ class ScreeningResult:
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
-    def rank_candidate_pairs(self, among: Sequence[str]) -> list[ScoredCandidatePair]:
+    def rank_candidate_pairs(self, among: Collection[str]) -> list[ScoredCandidatePair]:
         """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
@@ -322,9 +316,9 @@ def screen_candidates(
     problem: AllCandidatesProblem, base: Sequence[EffectBase], values: Mapping[str, float]
 ) -> ScreeningResult:
     """Compute detectability, scores and confusability of all candidates that are not in `base`, at `values`."""
-    point = linearize_candidates(problem, base, values)
-    series, residual = channels_with_residual_indices(problem.problem), point.projected_residual
-    grids = grouped((own.effect.label, own) for own in point.signatures)
+    residual, signatures = linearize_candidates(problem, base, values)
+    series = channels_with_residual_indices(problem.problem)
+    grids = grouped((own.effect.label, own) for own in signatures)
     visible, scores, kept = list[CandidateDetectability](), list[ScoreTestResult](), list[_EffectSignature]()
     for grid in grids.values():
         # the smallest amplitude that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
@@ -352,10 +346,8 @@ def changes_by_candidates_at_location(
     It is the candidate with the largest predicted decrease of r'r whose p-value is below `level`. Effects without one
     are left out.
     """
-    names, found = [name for effect in base for name in effect.parameters.names], dict[str, float]()
-    for effect in base:
-        alike = (s for s in screened.candidate_scores if s.effect.location == effect.location and s.p_value < level)
-        if best := next(alike, None):
-            changes = dict(zip(names, best.base_changes, strict=True))
-            found |= {name: changes[name] for name in effect.parameters.names}
-    return found
+    names = [name for effect in base for name in effect.parameters.names]
+    significant = grouped((s.effect.location, s) for s in screened.candidate_scores if s.p_value < level)
+    best = {place: dict(zip(names, own[0].base_changes, strict=True)) for place, own in significant.items()}
+    changed = [effect for effect in base if effect.location in best]
+    return {name: best[effect.location][name] for effect in changed for name in effect.parameters.names}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,8 +38,6 @@ class SelectedEffect:
     cumulative_closure: null_test.HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
     shares: tuple[float, ...]  # of the probability that one of them is a cause
-    # by effect parameter: std of what further effects, in the gap that is left, may contribute to its value
-    model_error_std: dict[str, float] = field(default_factory=dict)
 
 
 def total_gap_closure(entries: Sequence[SelectedEffect]) -> null_test.HeldOutGapClosure:
@@ -159,12 +158,13 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
 
 def select_effects(
     search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
-) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...]]:
+) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...], dict[str, float]]:
     """Add effects one by one to close the held-out gap, then try to replace and remove each of them.
 
     If `moved` (the nominal fit has left the estimates of an earlier run), candidates are also tried from those
-    estimates. Returns the fits of single effects in the first round and the selected effects. The fit of the chosen
-    effect comes first (its last fit if no other effect is selected), then all other fits by held-out loss.
+    estimates. Returns the fits of single effects in the first round, the selected effects, and by effect parameter the
+    std of what further effects may contribute to it. The fit of the chosen effect comes first (its last fit if no other
+    effect is selected), then all other fits by held-out loss.
     """
     limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
@@ -204,28 +204,27 @@ def select_effects(
         later += [fit.statistics() for fit in fits]
         near = _near_best_models(nominal, _plausible_beside(base, fits, limits), limits)
     chosen = _reconsidered(search, nominal, chosen, before, rivals)
-    if len(chosen.effects) == 1:
-        best = chosen.effects[0].label
-        single[best] = chosen  # it may differ from the first fit
-    known = {join_effect_labels(fit.effects): fit for fit in (*single.values(), chosen)}
+    known = single | {join_effect_labels(chosen.effects): chosen}  # it may differ from the first fit
     added = []
     for i, effect in enumerate(chosen.effects, 1):
         name = join_effect_labels(chosen.effects[:i])
         fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
         closed = null_test.held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
         same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
-        added.append(SelectedEffect(effect, fit, closed, *same, _model_error_std(fit, later, limits)))
-    return tuple(sorted(single.values(), key=lambda fit: (fit.effects[0].label != best, _chi2(fit)))), tuple(added)
+        added.append(SelectedEffect(effect, fit, closed, *same))
+    alone = [fit for fit in known.values() if len(fit.effects) == 1]
+    alone.sort(key=lambda fit: (fit is not chosen, fit.effects[0].label != best, _chi2(fit)))
+    return tuple(alone), tuple(added), _model_error_std(chosen, later, limits)
 
 
 def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: EffectBase) -> list[EffectsWithStart]:
     """The pairs of candidates to refit: best penalised decrease first, without confusable duplicates."""
-    chosen, most = list[EffectsWithStart](), search.thresholds.signature_overlap
+    chosen, known, most = list[EffectsWithStart](), set[tuple[str, ...]](), search.thresholds.signature_overlap
     for pair, values, _ in search.rank_candidate_pairs(screened, without.label):
-        one, other = ({own.label, *screened.candidates_confusable_with(own.label, most)} for own in pair)
-        before = [order for known, _ in chosen for order in (known, known[::-1])]
-        if not any(a.label in one and b.label in other for a, b in before):
+        alike = ({own.label, *screened.candidates_confusable_with(own.label, most)} for own in pair)
+        if known.isdisjoint(itertools.product(*alike)):
             chosen.append((pair, values))
+            known.update(itertools.permutations(own.label for own in pair))
     return chosen[: search.thresholds.n_refit_pairs]
 
 

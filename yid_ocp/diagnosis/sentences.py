@@ -113,7 +113,7 @@ def _lead(result: DiagnosisResult) -> str:
     since = f"With {100 * result.rival_probability:.0f} % probability, no effect is missing, but parameters have "
     since += f"changed since the baseline: {moved}."
     shares = sorted([(result.probability, probable), (result.rival_probability, since)], reverse=True)
-    probable = " ".join(text for share, text in shares if share)
+    probable = " ".join(_said(*shares))
     use = "Use the model for motions like these."
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
     none = f"{use} There is no relevant gap: {sizes}. The recordings {shown}."
@@ -171,9 +171,8 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
     groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
     words = {group: f"the readings of {group}" for group in groups}
-    alike = ([p.location, *p.indistinguishable_from] for p in where)
-    texts = [" or ".join(words.get(place, place) for place in places) for places in alike]
-    named = [f"{text} ({100 * place.gap_share:.0f} %)" for place, text in zip(where, texts, strict=True)]
+    alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
+    named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     is_told = has_origin and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
@@ -182,20 +181,22 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on where a gap lies, on the selected effects, and on the error that is left."""
-    added, limits = result.selected_effects, result.thresholds
-    names, total = listed([entry.effect.label for entry in added]), result.closure_by_selected_effects
+    added, where = result.selected_effects, gap_locations_sentence(result, has_origin=True)
+    if not added:
+        return [where, *_remains(result)]
+    names, total = listed([entry.effect.label for entry in added]), added[-1].cumulative_closure
     removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
     low, high = (f"{100 * end:.3g}" for end in (total.ci_low, total.ci_high))
     interval = f" (95 % interval {low} to {high} %)" * (low != high)
     unknown = f"{removed} an unknown part {of}"
     is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
     closed = _said(
-        (added and math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of}{interval}."),
-        (added and is_within, f"{unknown}, because the nominal model's error there is within noise."),
-        (added, f"{unknown}."),
-    )[:1]
-    sizes = [_named(entry.effect, added[-1].refitted_model, limits) for entry in added]
-    return [gap_locations_sentence(result, has_origin=True), *closed, *sizes, *_remains(result)]
+        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of}{interval}."),
+        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
+        (True, f"{unknown}."),
+    )[0]
+    sizes = [_named(entry.effect, added[-1].refitted_model, result.thresholds) for entry in added]
+    return [where, closed, *sizes, *_remains(result)]
 
 
 def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
@@ -217,23 +218,22 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "Every second block of time is held out (recordings.held_out: none). Only `yid-ocp solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
-    divided = result.nominal_model.problem.options.divided_links_model if result.is_corrected_for_links else None
+    divided = result.nominal_model.problem.options.divided_links_model
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
-    rows = [
+    return _said(
         (result.unknown_reason, _reason(result)),
-        (lost and tested, (other_channels, f"Hold out a recording that has {lost}, too.")),
+        (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
         (result.untried, (f"{limit}{listed(result.untried)}.", _longer_search(result))),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (events, (left_out, check)),
-        (divided, (links, f"For other commands, set {divided and divided.setting_text}.")),
-    ]
-    return [text for holds, text in rows if holds]
+        (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),
+    )
 
 
 def _reason(result: DiagnosisResult) -> tuple[str, str]:

@@ -10,6 +10,7 @@ from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.display import grouped
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.problem.options import ExcessResidualCriteria
@@ -93,11 +94,6 @@ class Judgement:
     rival_probability: float  # that these shifts are the cause
 
     @property
-    def closure_by_selected_effects(self) -> null_test.HeldOutGapClosure:
-        """The fraction of the gap that all selected effects close together. Undefined without effects."""
-        return total_gap_closure(self.selected_effects)
-
-    @property
     def accepted_selected_effects(self) -> tuple[SelectedEffect, ...]:
         """The effects that a verdict `effect` or `confusable` accepts, in the order added; none for other verdicts."""
         return self.selected_effects if self.verdict in ("effect", "confusable") else ()
@@ -105,8 +101,9 @@ class Judgement:
     def undetermined_sizes(self, limits: Thresholds) -> dict[str, list[str]]:
         """Both estimates, as texts, of the effects within `min_z` stds (which include the gap) of neutral, by label."""
         effects, fits = [e.effect for e in self.selected_effects], [e.refitted_model for e in self.selected_effects]
-        unsure = [own for own in effects if not fits[-1].determines_size(own, limits.min_z)]
-        return {own.label: [c.text for c in self.transfer_checks if c.effect.label == own.label] for own in unsure}
+        unsure = [own.label for own in effects if not fits[-1].determines_size(own, limits.min_z)]
+        texts = grouped((check.effect.label, check.text) for check in self.transfer_checks)
+        return {label: texts.get(label, []) for label in unsure}
 
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
@@ -126,7 +123,7 @@ class Judgement:
         """
         effects = (entry.effect for entry in self.selected_effects)
         count = len({effect.label if effect.is_local else effect.kind for effect in effects})
-        closed = self.closure_by_selected_effects.ci_low
+        closed = total_gap_closure(self.selected_effects).ci_low
         pairs = (self.explained_fraction, limits.min_explained_fraction), (closed, limits.min_closure)
         fitted, held_out = ((part, 1.0 - (1.0 - least) ** count) for part, least in pairs)
         return fitted, held_out
@@ -138,14 +135,14 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     Refits and screenings are requested by name and can come from a record, so the verdict depends on numbers alone.
     """
     limits, nominal = search.thresholds, evidence.nominal_model
-    fits, added = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...]()
+    fits, added, beside = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...](), dict[str, float]()
     if evidence.warrants_effect_search(limits):
-        fits, added = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
+        fits, added, beside = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
     search.record_stage_end_time("refits")
 
     carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
     if added:
-        last, beside = added[-1].refitted_model, added[-1].model_error_std
+        last = added[-1].refitted_model
         explained = _explained_fraction(nominal, last, limits)
         carried = _check_effect_amplitude_transfer(search, last)
         apart = {own.parameter: own.significant_disagreement_as_std for own in carried}
@@ -156,16 +153,15 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     reason = next((name for name, holds in reasons.items() if holds), "")
     # a gap that is seen only along a candidate's signature counts only with an accepted effect
     verdicts = {
-        "insufficient_data": not evidence.are_data_sufficient,
-        "unknown": bool(reason) and evidence.residual_exceeds_noise(limits),
-        "no_gap": bool(reason),
-        "confusable": any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]),
-        "effect": True,
+        ("insufficient_data", ""): not evidence.are_data_sufficient,
+        ("unknown", reason): bool(reason) and evidence.residual_exceeds_noise(limits),
+        ("no_gap", ""): bool(reason),
+        ("confusable", ""): any(len(entry.equivalent_effects) > 1 for entry in said.selected_effects[:1]),
+        ("effect", ""): True,
     }
-    verdict = next(name for name, holds in verdicts.items() if holds)
+    verdict, told = next(pair for pair, holds in verdicts.items() if holds)
     search.record_stage_end_time("transfer")
     probability = 0.0 if reasons["none"] else _probability(said, reasons["stand_in"], limits)
-    told = reason if verdict == "unknown" else ""
     return replace(said, verdict=verdict, unknown_reason=told, probability=probability)
 
 

@@ -21,8 +21,8 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
-from yid_ocp.diagnosis.hypotheses import make_candidate_effects
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefitStore, RefittedModel, StoredFit
+from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, make_candidate_effects
+from yid_ocp.diagnosis.refit import RefitStore, RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import torque_law_tables_csv
