@@ -1,7 +1,5 @@
 """Made-up pieces of small problems: recordings, measurements on nodes, sensors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca
