@@ -1,7 +1,5 @@
 """Progress that keeps what it is told."""
 
-from __future__ import annotations
-
 from yid_ocp.display import Progress
 
 

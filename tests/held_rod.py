@@ -1,7 +1,5 @@
 """A double pendulum that holds a rod with a relaxing branch, for tests of equations by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

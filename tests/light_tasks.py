@@ -1,7 +1,5 @@
 """Tasks for workers of a cluster, in a file that they import in no time."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A cross of flexible branches turned by a wrist, played in MuJoCo as a chain several times as fine as the model's."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

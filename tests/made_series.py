@@ -1,7 +1,5 @@
 """Outputs and samples, as far as rules that look at residuals need them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A double pendulum whose motion is known and whose joint efforts are measured: quick, and every verdict can occur."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Made-up pieces of small problems: recordings, measurements on nodes, sensors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca
@@ -16,6 +14,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import SensorMeasurements
+from yid_ocp.sensors import sensor_function_with_jacobians
 from yid_ocp.sensors.joints import PrescribedJointEffortSensor
 from yid_ocp.sensors.points import PointSensor
 
@@ -66,6 +65,7 @@ def recording(group=None, *groups, name="made") -> Recording:
 
 H, STEPS = 0.01, 24
 PENDULUM = ("shoulder", "elbow")
+TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 
 
 def pendulum_step(folder, effects=(), **how):
@@ -127,6 +127,14 @@ def places(system, frames, q):
     return found if np.ndim(q) == 2 else found[0]
 
 
+def read(system: System, sensor, q=None, effort=None) -> np.ndarray:
+    """Outputs of a sensor at the parameters' nominal values."""
+    n = system.n_coordinates
+    function = sensor_function_with_jacobians(system, sensor, ())
+    at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
+    return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
+
+
 def swinging_pendulum(folder, *effects):
     """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
 
@@ -150,6 +158,10 @@ def swinging_pendulum(folder, *effects):
         return recording(None, group, name=f"swing_{seed}")
 
     return step, record
+
+
+def keeps_inputs(made) -> bool:
+    return all(made.predictor.are_input_corrections_neutral_and_fixed(e, made.theta) for e in made.episodes)
 
 
 def torque_function(step, known):

@@ -1,7 +1,5 @@
 """What must hold of every finding of a diagnosis, whatever it is: checked of all findings of the tests."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Scores and verdicts of the benchmarks, and a small part of what they do; their timing is not a test."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.util

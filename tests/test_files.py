@@ -1,7 +1,5 @@
 """Files that appear whole or not at all, and hashes of files, data and sources."""
 
-from __future__ import annotations
-
 import ast
 import json
 import math

@@ -1,7 +1,5 @@
 """`benchmarks/peers`: figures of the documentation are those of its results, and a part of what it does."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The model beside Pinocchio's: agreement where both are right, a clear sentence where one number is wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Runs side by side: means, drifts and the run to distrust, against closed forms and drawn estimates."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

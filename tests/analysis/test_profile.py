@@ -1,7 +1,5 @@
 """Profile likelihood on formulas whose intervals are known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

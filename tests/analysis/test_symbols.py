@@ -1,7 +1,5 @@
 """Rows and columns of a step by name: what stands under a name, its derivative, and names that do not exist."""
 
-from __future__ import annotations
-
 import math
 import re
 

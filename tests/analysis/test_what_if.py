@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -194,11 +195,8 @@ def test_springs_need_a_marker_off_the_axis_or_the_joint(springs):
     assert [entry.changes for entry in what_if(springs("series_ends")).smallest_sufficient_sets] == [("camera:joint",)]
 
 
-def missing(*arguments, **settings):
-    raise DataError("MuJoCo is not installed", hint="")
-
-
 def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run, monkeypatch):
+    missing = Mock(side_effect=DataError("MuJoCo is not installed", hint=""))
     monkeypatch.setattr(experiment_design, "simulate_in_mujoco", missing)
     builder = ExperimentVariantSensitivityBuilder(UnchangedExperiment(short_run, short_run.initial_unknowns))
     other = builder.position_sensitivities_of_variant(frozenset({"motion"}))

@@ -1,7 +1,5 @@
 """Solves that fail, interruptions and bugs: exit codes 1, 130 and 3, and what they leave behind."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

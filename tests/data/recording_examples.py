@@ -1,7 +1,5 @@
 """Recordings that the tests of this folder share."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small made-up inputs of the rules of a diagnosis. Nothing is rolled out, and every constructor is called here."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

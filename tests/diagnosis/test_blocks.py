@@ -1,7 +1,5 @@
 """What is held out: blocks of one recording, and recordings as far as the nominal model can follow them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 

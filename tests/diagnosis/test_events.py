@@ -1,7 +1,5 @@
 """Events of a two-joint arm that MuJoCo plays: pushes, a snag, a wrong encoder sample, and nothing at all."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

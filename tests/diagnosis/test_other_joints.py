@@ -1,7 +1,5 @@
 """A bare arm with efforts from Pinocchio's inverse dynamics: an effect is found at whatever joint it sits."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The blind proof, rule by rule: what is drawn, and how large."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections import Counter

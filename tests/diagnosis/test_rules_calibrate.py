@@ -1,7 +1,5 @@
 """Thresholds as quantiles: conformal coverage, which cases count, what a threshold would do to the others."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

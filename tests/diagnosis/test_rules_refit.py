@@ -3,6 +3,7 @@
 import importlib
 import math
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -278,9 +279,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
 
 
 def test_where_the_model_with_all_candidates_fails_there_are_none(monkeypatch):
-    def snap(problem, base, values):
-        raise SolverError("it snaps", where="model", hint="")
-
+    snap = Mock(side_effect=SolverError("it snaps", where="model", hint=""))
     monkeypatch.setattr(module, "screen_candidates", snap)
     search = RefitContext(TWO_RECORDINGS, LIMITS, Heard(), n_batched=2)
     assert search.screen((FRICTION,), {A: 0.7}, "beside it").candidate_scores == ()

@@ -1,7 +1,5 @@
 """Losses, closures and the choice among refits, rule by rule."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

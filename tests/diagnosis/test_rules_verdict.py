@@ -39,10 +39,6 @@ def judgement(chosen, again=None, *, nominal=NOMINAL, gap=True, enough=True, sea
         return judge(search, evidence)
 
 
-def scored(*p_values):
-    return [f.score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
-
-
 def seen(tests, scores=()):
     return NominalModelGapEvidence(fit(), *tests, f.screening(scores, [f.visible(ONE)]))
 
@@ -77,7 +73,8 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     },
 )
 def test_a_gap_along_a_candidate_counts_its_tries(p_values, gap):
-    evidence, limits = seen((f.outcome(), f.outcome()), scored(*p_values)), Thresholds(gap_significance_level=0.01)
+    scores = [f.score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
+    evidence, limits = seen((f.outcome(), f.outcome()), scores), Thresholds(gap_significance_level=0.01)
     assert (evidence.warrants_effect_search(limits), evidence.residual_exceeds_noise(limits)) == (gap, False)
     assert not replace(evidence, discretisation_chi2=1e9).warrants_effect_search(limits), "the step may remove it"
 

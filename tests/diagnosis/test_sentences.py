@@ -4,8 +4,6 @@ After a change that is meant `PYTHONPATH=.:tests:tests/diagnosis python tests/di
 file again; its difference is to be read.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A diagnosis weighs recordings by the noise that drives the motion, and the smoother knows of it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

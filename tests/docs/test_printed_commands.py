@@ -1,7 +1,5 @@
 """Commands run as the pages print them, in a folder with the files that they name, the costly ones as slow tests."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

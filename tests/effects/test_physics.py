@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from small_problems import read
 
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -16,7 +17,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, Mechanism, System, flexible_ob
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, homogeneous_transform, rotation_from_rpy
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.problem.evaluation import estimated_initial_state_names, max_abs_initial_internal_offsets
-from yid_ocp.sensors import PointSensor, PositionSensor, PrescribedJointEffortSensor, sensor_function_with_jacobians
+from yid_ocp.sensors import PointSensor, PositionSensor, PrescribedJointEffortSensor
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
 INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
@@ -359,14 +360,6 @@ def test_where_it_begins_is_estimated_with_every_recording() -> None:
     assert estimated_initial_state_names(whole, options, (), known) == (name,)
 
 
-def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
-    whole = system.with_effects(effects)
-    function = sensor_function_with_jacobians(whole, sensor, ())
-    n = whole.n_coordinates
-    at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
-    return np.array(function(**at, theta=whole.parameters.vector())["y"]).ravel()
-
-
 @pytest.mark.parametrize(
     ("kind", "values", "angle", "torque"),
     [
@@ -380,8 +373,8 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
 def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     system, names = hinge(), ("left_a",)
     effect = make_effect(kind, "left_a", system, values)
-    sensors = PositionSensor(names), PrescribedJointEffortSensor(names)
-    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in sensors]
+    whole, sensors = system.with_effects([effect]), (PositionSensor(names), PrescribedJointEffortSensor(names))
+    seen = [read(whole, sensor, [0.5], [3.0])[0] for sensor in sensors]
     assert seen == pytest.approx([angle, torque])
     channels = zip(("joints.position.left_a", "joints.effort.left_a"), seen, strict=True)
     back = [effect.true_value_from_reading(channel, ca.SX(reading), ca.SX(3.0)) for channel, reading in channels]
@@ -398,12 +391,12 @@ def test_cameras_see_points_elsewhere() -> None:
     system = link(prescribed=())
     eye = PointSensor("points_camera", ("w_T1",), ("w_T1",), tuple(map(tuple, POSE)))
     true, centre = np.array([0.0, 0.0, LENGTH]), POSE[:3, 3]
-    assert read(system, [], eye) == pytest.approx(true)
+    assert read(system, eye) == pytest.approx(true)
 
     def seen(kind: str, **values: float) -> np.ndarray:
-        effect = make_effect(kind, "camera", system, values)
-        assert read(system, [effect], PointSensor("points_mocap", ("w_T1",), ("w_T1",))) == pytest.approx(true)
-        return read(system, [effect], eye)
+        whole = system.with_effects([make_effect(kind, "camera", system, values)])
+        assert read(whole, PointSensor("points_mocap", ("w_T1",), ("w_T1",))) == pytest.approx(true)
+        return read(whole, eye)
 
     assert seen("camera_translation", x=0.01, z=-0.02) - true == pytest.approx([0.01, 0.0, -0.02])
     turned = seen("camera_rotation", ry=0.05)

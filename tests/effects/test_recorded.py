@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+from small_problems import STEPS, H, keeps_inputs
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
@@ -17,7 +18,6 @@ from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
 from yid_ocp.sensors import camera_pose_of_point_group, sensor_function_with_jacobians
 from yid_ocp.solvers import MultipleShooting
 
-H, STEPS = 0.01, 24
 NAMES = ("left_a", "left_b", "left_c")
 KINDS = {
     "encoder_offset": {"left_b": {"offset": 0.01}},
@@ -72,10 +72,6 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     gains = (20.0, 20.0, 10.0)
     settings = ProblemOptions(**OPEN, arm_tracking_feedback=feedback, arm_proportional_gains=gains, **options)
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
-
-
-def keeps_inputs(made) -> bool:
-    return all(made.predictor.are_input_corrections_neutral_and_fixed(e, made.theta) for e in made.episodes)
 
 
 CASES = [("prescribed", "none"), ("driven", "proportional"), ("driven", "lqr")]

@@ -1,7 +1,5 @@
 """Signals: MCAP files, read back by the packages of the MCAP project, and tables that read back as what was written."""
 
-from __future__ import annotations
-
 import json
 import math
 import tempfile

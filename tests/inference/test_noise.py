@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from held_rod import held_rod
-from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
+from small_problems import PENDULUM, TRACKED, H, correlated, joints, pendulum_step, recording, seen, taken
 
 from yid_ocp.inference import kalman, whitening
 from yid_ocp.inference.smoother_model import residual_models_with_smoother_unknowns
@@ -16,7 +16,6 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 
 
 def problem_of(

@@ -1,7 +1,5 @@
 """What the smoother adds, against dense algebra over all disturbances and parameters at once."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

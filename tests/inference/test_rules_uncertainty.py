@@ -1,7 +1,5 @@
 """How sure a fit is and what may be said of it, rule by rule: the null test, misfit, bounds, verdicts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Small systems that together use every feature of a step, and effects that bring these features in."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,8 +1,6 @@
 """Steps that are hard to solve: both kernels reach the same point, its derivatives and, where there is none, the same
 status. The kernels share nothing but the equations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Equilibria: which one is found, its derivatives, and what is said where there is none."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

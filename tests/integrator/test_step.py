@@ -1,7 +1,5 @@
 """What a step does: prescribed coordinates and their effort, internal and compliant coordinates, grasps, failures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Numbers of symbolic kinematics."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

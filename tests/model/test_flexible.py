@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -247,10 +246,9 @@ def test_a_tip_load_bends_it_as_beam_theory_says(links: int) -> None:
     assert float(place[1]) == pytest.approx(expected, rel=3 / links**2 + 2e-3)
 
 
-def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
+def test_a_configuration_and_init_describe_it(written) -> None:
     text = "{kind: tapered_rod, length: 1.2, mass: 0.05, base_radius: 0.006, tip_radius: 0.003, links: 4}"
-    (tmp_path / "run.yaml").write_text(f"model: {{object: {text}}}\nparameters: {{rod.taper: {{initial: 0.4}}}}\n")
-    run = load_config(tmp_path / "run.yaml")
+    run = load_config(written(f"model: {{object: {text}}}\nparameters: {{rod.taper: {{initial: 0.4}}}}\n"))
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
     assert len(system.find_segment_layout("rod").link_joints) == 8

@@ -1,7 +1,5 @@
 """URDF files: what is kept, locked, merged and refused, and the way back to text."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path, PurePosixPath
 

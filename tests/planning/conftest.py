@@ -33,15 +33,9 @@ def moved(limited_urdf):
 
 
 @pytest.fixture
-def pendulum(limited_urdf, tmp_path):
+def pendulum(limited_urdf, written):
     """Write a configuration of the pendulum with more lines."""
-
-    def write(more, points="tip"):
-        file = tmp_path / "pendulum.yaml"
-        file.write_text(PENDULUM.format(urdf=limited_urdf, points=points) + more)
-        return file
-
-    return write
+    return lambda more, points="tip": written(PENDULUM.format(urdf=limited_urdf, points=points) + more, "pendulum.yaml")
 
 
 @pytest.fixture

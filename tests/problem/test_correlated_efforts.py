@@ -1,7 +1,5 @@
 """Measured efforts count for as much as they tell: smoothed ones, and errors of one acceleration in all of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """First-order lags beside the differential equation, their derivatives, and the way back."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
+from small_problems import PENDULUM, STEPS, TRACKED, H, keeps_inputs, pendulum_step, taken
 
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions, episode_prediction
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel, truncate_episode
@@ -24,7 +24,6 @@ DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "sh
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
 STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 FILTERED = {"arm_tracking_feedback": "lqr"}
 CASES = {
     "free": ((), {}, {}),
@@ -168,10 +167,6 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
     offset = problem.predictor.corrected_inputs(episode, vector(neutral | {"effort_offset@shoulder.offset": 0.5}), ())
     np.testing.assert_allclose(offset.torque, episode.torque - 0.5, atol=1e-12)
     np.testing.assert_allclose(offset.first_torque, episode.torque[0] - 0.5, atol=1e-12)
-
-
-def keeps_inputs(made) -> bool:
-    return all(made.predictor.are_input_corrections_neutral_and_fixed(e, made.theta) for e in made.episodes)
 
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):

@@ -1,7 +1,5 @@
 """One step from each state of trep's trajectories, its first derivatives, and the numbers of the model."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Kinematics, mass matrix, gravity and inverse dynamics against Pinocchio, joints and frames matched by name."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Pages: of a result alone, of a solve and of a diagnosis; each says what the terminal says, in any browser."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html

@@ -1,7 +1,5 @@
 """Tables and sentences at the end of a command; a parameter's verdict reads alike wherever it stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from held_rod import held_rod
-from small_problems import H, measured
+from small_problems import H, measured, read
 
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
@@ -44,14 +44,6 @@ def system() -> System:
         FlexibleSegment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=turn),
     )
     return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
-
-
-def read(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
-    """Outputs at the parameters' nominal values."""
-    n = system.n_coordinates
-    function = sensor_function_with_jacobians(system, sensor, ())
-    at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
-    return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
 
 
 class Drift(Effect):

@@ -1,7 +1,5 @@
 """A branched cable whose stiffnesses are far from their start: a search that stalls at a bound of zero fails here."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from small_problems import PENDULUM, STEPS, pendulum_step, taken
+from small_problems import PENDULUM, STEPS, TRACKED, pendulum_step, taken
 
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import (
@@ -26,7 +26,6 @@ from yid_ocp.solvers.nonlinear_program import (
 )
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
-TRACKED = {"arm_tracking_feedback": "proportional", "arm_proportional_gains": (9.0,)}
 CASES = {
     "free": ((), {}, {}),
     "robust": ((), {}, {"huber_threshold": 0.8}),

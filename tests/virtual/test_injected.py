@@ -1,7 +1,5 @@
 """Effects as the other engine does them: against the library's equations, or the potential or rule they follow."""
 
-from __future__ import annotations
-
 import math
 from unittest.mock import Mock
 

@@ -1,7 +1,5 @@
 """Systems and effects in MuJoCo's terms: equal to the equations that they have here, or refused."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

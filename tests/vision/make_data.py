@@ -3,8 +3,6 @@
 PYTHONPATH=. python tests/vision/make_data.py
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

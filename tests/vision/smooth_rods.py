@@ -4,8 +4,6 @@ A rod is an arc: its curvature turns its direction evenly along its length. Its 
 depth has noise that grows with the square of the distance, and some pixels at edges mix front and back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -134,10 +135,7 @@ def test_the_spline_passes_through_the_good_frames(clean, system):
     assert np.array_equal(found.point_positions_at_time(found.t[-1] + 5.0), found.point_positions_at_time(found.t[-1]))
 
 
-def unreadable(_=0):
-    raise DataError("the point cloud cannot be used", hint="")
-
-
+UNREADABLE = Mock(side_effect=DataError("the point cloud cannot be used", hint=""))
 DUST = np.random.default_rng(0)
 BAD = {
     "the cloud has no finite points": lambda points: points[:0],
@@ -146,7 +144,7 @@ BAD = {
     "no point lies in the region that the object can reach": lambda points: points + np.array([30.0, 0.0, 0.0]),
     "too few points of the object": lambda points: points[:60],
     "an end is not where its gripper is": lambda points: points * [1.0, 1.0, 1.05],
-    "the point cloud cannot be used": lambda points: unreadable(),
+    "the point cloud cannot be used": UNREADABLE,
     "": lambda points: points + DUST.uniform(-0.3, 0.3, points.shape),  # random points are no object
 }
 
@@ -184,7 +182,7 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, scale, lowest, messag
     assert f"in {len(small.clouds)} of {len(small.clouds)} frames, " in caught.value.what  # all for one reason
     assert "dimensions contradict the model" not in caught.value.what
     assert caught.value.hint
-    told = SceneDescription(system), small.recording, replace(sequence, load_cloud=unreadable), options
+    told = SceneDescription(system), small.recording, replace(sequence, load_cloud=UNREADABLE), options
     tracker = SingleFrameTracker(*told)
     tracker.arm_surface, tracker.calibration_frames = tracker, (0, 1)
     with pytest.raises(

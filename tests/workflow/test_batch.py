@@ -1,7 +1,5 @@
 """Many runs: a batch, in which a failing one stops no other and what is done is not done again; blind validation."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -1,7 +1,5 @@
 """Progress on a terminal and in lines, and what commands print."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import math

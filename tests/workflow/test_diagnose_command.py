@@ -1,7 +1,5 @@
 """The command `diagnose`: run folder and words, interrupted runs, kept refits, noise scaled to a fraction."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Models in other formats."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """The command `import`."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

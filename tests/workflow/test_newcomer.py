@@ -1,7 +1,5 @@
 """A new user: a bag from MuJoCo of an arm that holds a flexible object, and commands whose files are not edited."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Mapping
