@@ -107,9 +107,18 @@ def test_a_solve_says_what_is_not_found():
     lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
     said = " ".join(lines)
     assert ("Fix a at a known value" in said, "a (motion too weak). `yid-ocp" in said) == (True, True)
+    more = [issue | {"where": place, "setting": f"parameters.{place}.free: false"} for place in "bcd"]
+    many = told("yid-solve/1", solved(parameters=both, issues=[issue, *more]))
+    assert ("Issues:" in lines, "Issues:" in many, "warning, b, c, d (warning): " in " ".join(many)) == (
+        False,
+        True,
+        True,
+    )
+    at = many.index("  --set parameters.a.free=false")
+    assert many[at + 1 : at + 4] == [f"  --set parameters.{own}.free=false" for own in "bcd"]
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
-    parts = "the fit did not converge", "limit after 4 iterations in all starts", "2e+03 times the chi2 of noise, first"
+    parts = "the fit did not converge", "limit after 4 iterations in all starts", "2000 times the chi2 of noise, first"
     assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())

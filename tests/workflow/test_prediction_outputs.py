@@ -219,7 +219,7 @@ def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
     (doubt,) = estimation._worse_than_baseline_issues([said], UNITS)
-    assert all(fact in doubt.what for fact in ("model", "rms error", "0.2 m", "'stays'", "0.1 m"))
+    assert all(fact in doubt.what for fact in ("model", "rms error", "0.2 m", "'constant readings'", "0.1 m"))
     assert doubt.limit_violation_ratio == pytest.approx(0.2 / 0.105)
 
 

@@ -274,7 +274,7 @@ def joint_excitation_issues(
         if name and widest < limit:
             least = f"distinguish {', '.join(parameters)} from a constant effort, it must turn by {limit:.2g} rad"
             words = f"{joint} turns by at most {widest:.2g} rad (in {name}). To {least}"
-            advice, depth = f"turn {joint} further, or fix {' and '.join(parameters)}", limit / max(widest, 1e-9)
+            advice, depth = "turn the joint further, or fix its parameters", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
@@ -407,10 +407,9 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = (
-                f"the effort of {names[j]} is {_ratio_text(usual / inverse)} times what gravity and motion require. "
-            )
-            words += f"The ratio is {off:.3g} of its standard deviations away from {usual:g} ({_MIN_Z:g} are tolerated)"
+            words = f"the effort of {names[j]} is {_ratio_text(usual / inverse)} times what gravity and motion require "
+            words += f"(all efforts: {usual:g} times; " if usual != 1.0 else "("
+            words += f"1/{factor:g} to {factor:g} times{' this' * (usual != 1.0)} is tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)

@@ -282,6 +282,7 @@ class _QualityLimits:
     max_rate_ratio: float = 1.3
     max_noise_ratio: float = 3.0
     max_overstatement_ratio: float = 5.0
+    min_noise: float = 1e-6  # of any sensor [m, rad or N m]
     min_stuck_time: float = 0.3
     min_stuck_samples: int = 12
     max_unseen_rotation: float = 0.03

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 TableRows = list[Sequence[str]]
 _MAX_REMEDIES_PER_CAUSE = 3
+_MAX_PLACES = 4  # places of one kind of issue that a sentence names
+_MIN_TABLE_ISSUES = 4  # number of issues from which on a table gives an overview
 _MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
@@ -99,7 +101,7 @@ def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
 
 
 def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True) -> SummaryBlockOrTextIterator:
-    """Yield the issues of the recordings in a result as a table, with advice and settings for each cause."""
+    """Yield the issues in a result with numbers, advice and settings for each cause, and a table if there are many."""
     issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
@@ -108,19 +110,24 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         parts = [*grouped(("setting" if own["setting"] else own["advice"], own) for own in alike).values()]
         last = [entry for part in parts[_MAX_REMEDIES_PER_CAUSE - 1 :] for entry in part]
         for first, *others in filter(None, [*parts[: _MAX_REMEDIES_PER_CAUSE - 1], last]):
-            where, do = first["where"] + f" and {len(others)} more" * bool(others), first["advice"]
+            places = list(dict.fromkeys(own["where"] for own in (first, *others)))
+            where, do = abbreviated_names_text(places, _MAX_PLACES), first["advice"]
             rows.append((words, where, first["certainty"]))
-            # the first issue is the strongest; its line counts if others give the same setting another value
-            lines = {own["setting"].partition(":")[0]: own["setting"] for own in (*others[::-1], first)}
+            lines = dict[str, str]()
+            for own in (first, *others):  # the first issue is the strongest; its value of a setting counts
+                lines.setdefault(own["setting"].partition(":")[0], own["setting"])
             options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
             do += f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else "."
-            text = f"{words}{f' ({where})' * (len(alike) > 1)}: {first['what']}. {do[0].upper()}{do[1:]}"
+            certainty = f" ({first['certainty']})" * (first["certainty"] != "certain")
+            # several places differ in their numbers
+            example = " at the first place," * any(own["what"] != first["what"] for own in others)
+            text = f"{where}{certainty}:{example} {first['what']}. {do[0].upper()}{do[1:]}"
             advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
         yield f"Before you use values, follow the advice below on these issues, which the verdicts leave out: {mild}."
-    yield SummaryTable(rows, "Issues of the recordings")
+    yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 
 
