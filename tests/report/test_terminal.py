@@ -150,9 +150,9 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     lines = told("yid-identifiability/1", doubtful)
     assert (" ".join(lines[:3]), "a -160 %, b +2.4 N m/rad" in lines) == (first, True)
     assert "1 N m/rad" in line_of(lines, "b"), "there is no percentage of zero"
-    again = line_of(lines, "compute exact intervals, which may be asymmetric")
+    again = lines[lines.index("compute exact intervals, which may be asymmetric:") + 1]
     assert again.endswith(" --intervals all --unknown-grasp --unknown-start")
-    assert line_of(lines, "find the cause of the model's error").endswith(" yid-ocp diagnose CONFIG")
+    assert lines[lines.index("find the cause of the model's error:") + 1] == "  yid-ocp diagnose CONFIG"
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,8 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     lines = told("yid-identifiability/1", result)
     assert any("Fewest changes with which all parameters would be found: a weld." in line for line in lines)
-    assert line_of(lines, "estimate from FILE, a recording with a weld").endswith("'recordings.estimate=[FILE]'")
+    at = lines.index("estimate from FILE, a recording with a weld:")
+    assert lines[at + 1].endswith("'recordings.estimate=[FILE]'")
     assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"
 
 
@@ -265,8 +266,8 @@ def test_tables_are_aligned_without_empty_columns():
     lines = terminal.aligned_table_lines([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
     recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
-    *_, row, _, end = terminal.recording_summary_lines(recording)
-    assert (" ".join(row.split()), end) == ("joints 2 10 0.1 0.1 position [rad] a, b", "duration: 0.1 s")
+    *_, row = terminal.recording_summary_lines(recording)
+    assert " ".join(row.split()) == "joints 2 10 0.1 0.1 position [rad] a, b"
 
 
 def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():

@@ -98,12 +98,13 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
     for recording in (first, other):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
-    said = f"{first.name} and {other.name} are assumed to have one clock, as their times overlap by {overlap:.4g} s"
+    part = f"their times overlap by {overlap:.4g} of {max(end - begin, stop - start):.4g} s"
+    said = f"{first.name} and {other.name} are assumed to have one clock ({part})"
     if shared:
         late = _late_points(first, other, other.name, 0.0)
         if late:
             return 0.0, f"{said}, so nothing was shifted. But {late}"
-        return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS (added)"
+        return 0.0, f"{said}. If not, import again with --clock-offset {other.name}=SECONDS, added to its times"
     best = _motion_lag(first, other, begin - start)
     if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"

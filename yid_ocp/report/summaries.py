@@ -522,8 +522,9 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
     yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
-    option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
-    yield next_steps_table(result, {"estimate parameters from this recording": f"solve --set {shlex.quote(option)}"})
+    option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
+    step = {"estimate parameters from it": f"solve --set {option} --set 'recordings.held_out=[]'"}
+    yield next_steps_table(result, step)
 
 
 @SUMMARIES.register("yid-track/1")

@@ -53,6 +53,7 @@ class SummaryTable:
     title: str = ""
     is_key_table: bool = False  # whether a page shows it next to the verdict
     is_page_only: bool = False  # whether a terminal omits it
+    is_list: bool = False  # whether a terminal shows the second of two columns below the first
     links: Mapping[str, str] = field(default_factory=dict)  # linked page by the text of a cell in the first column
 
 
@@ -139,7 +140,7 @@ def next_steps_table(result: Mapping[str, Any], steps: Mapping[str, str]) -> Sum
     for purpose, text in steps.items():
         command, _, options = text.partition(" ")
         rows.append((purpose, " ".join(filter(None, ("yid-ocp", command, config, options)))))
-    return SummaryTable(rows, "Next steps")
+    return SummaryTable(rows, "Next steps", is_list=True)
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -149,13 +150,14 @@ def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield the found values of a result to copy, as text, YAML, MJCF and LaTeX. Nothing if none is found."""
+    """Yield the found values of a result to copy, as text (except after `solve`), YAML, MJCF and LaTeX."""
     if use := result.get("to_use"):
-        ignored = " and ".join(use["uncounted_errors"])
-        yield f"Values to use (± is one standard deviation{f', without the error {ignored}' if ignored else ''}):"
-        yield CodeBlock("\n".join(use["values"]))
-        lost = abbreviated_names_text(use.get("left_out", ()))
-        yield f"Too uncertain, so not listed: {lost}." if lost else ""
+        ignored, lost = " and ".join(use["uncounted_errors"]), abbreviated_names_text(use.get("left_out", ()))
+        yield f"The ± leaves out the error {ignored}." if ignored else ""
+        if result.get("format") != "yid-solve/1":  # whose table has the values
+            yield "Values to use (± is one standard deviation):"
+            yield CodeBlock("\n".join(use["values"]))
+            yield f"Too uncertain, so not listed: {lost}." if lost else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():
@@ -255,7 +257,9 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
     for block in blocks:
         if isinstance(block, SummaryTable):
             above = [""] * bool(result and result[-1]) + [f"{block.title}:"] * bool(block.title)
-            result += [] if block.is_page_only else [*above, *aligned_table_lines(block.rows), ""]
+            listed = (line for first, second in block.rows[1:] for line in (f"{first}:", f"  {second}"))
+            lines = listed if block.is_list else aligned_table_lines(block.rows)
+            result += [] if block.is_page_only else [*above, *lines, ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         else:
@@ -264,14 +268,14 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 
 def recording_summary_lines(recording: Recording) -> list[str]:
-    """Return lines of text that describe a recording: a table of its groups, the duration and notes."""
-    rows: TableRows = [("group", "samples", "rate [Hz]", "longest gap [s]", "length [s]", "channels", "names")]
+    """Return lines of text that describe a recording: a table of its groups, and notes."""
+    rows: TableRows = [("group", "samples", "mean rate [Hz]", "longest gap [s]", "length [s]", "channels", "names")]
     for group in recording.all_groups:
         rate, gap, span = mean_sample_rate(group.t), np.diff(group.t).max(initial=0.0), group.t[-1] - group.t[0]
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", f"{gap:.3g}", f"{span:.4g}"
         names = abbreviated_names_text(group.names, math.inf)
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
-    return [*aligned_table_lines(rows), "", f"duration: {recording.duration:g} s", *_note_lines(recording.notes)]
+    return [*aligned_table_lines(rows), *_note_lines(recording.notes)]
 
 
 def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:

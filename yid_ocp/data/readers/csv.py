@@ -223,9 +223,9 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     sources, second = [], base.factor_to_si_by_quantity({**units, **dict(stated)}, str(path))["t"]
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out, its meaning is unknown"
+        becomes = ":".join(filter(None, meaning or ()))
         rate = mean_sample_rate(second * t[np.isfinite(column + t)]) if ok else math.nan
-        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
+        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes))
     return base.FilePreview(tuple(sources), options, (*notes, *(reason for _, reason in guessed)))
 
 
@@ -320,9 +320,10 @@ def _read_table(
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
-        listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        said = f"lines left out, because they are not rows of numbers: {len(bad)} of {n_lines} ({listed})"
-        notes = (f"{said}. In line {next(iter(bad))}, {next(iter(bad.values()))}. All other lines are used",)
+        (at, why), *others = bad.items()
+        said = f"{len(bad)} of {n_lines} lines are left out, because they are not rows of numbers. In line {at}, {why}"
+        listed = ", ".join(str(line) for line, _ in others[:_LISTED]) + ", ..." * (len(others) > _LISTED)
+        notes = (f"{said}. The others are {listed}" if others else said,)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
