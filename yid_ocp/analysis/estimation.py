@@ -148,9 +148,8 @@ def _checked_solution_and_issues(
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
-    # wrong data make a model worse than a guess
-    has_wrong_data = any(issue.severity != "warning" for issue in problem.options.data_issues)
-    found += [] if has_wrong_data else _worse_than_baseline_issues(errors, units)
+    if solution.goodness_of_fit.data_trusted:  # wrong data make a model worse than a guess
+        found += _worse_than_baseline_issues(errors, units)
     if any(issue.severity != "warning" for issue in found):
         untrusted = replace(solution.goodness_of_fit, data_trusted=False)
         marked = uncertainty.mark_free_estimates_not_trusted(solution.parameters)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
+from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, median_sample_period
 from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
 from yid_ocp.data.recording import Recording, validated_recording
 from yid_ocp.errors import DataError, require_known_names
@@ -72,8 +72,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     if groups:
         hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
         joints, more = joints_on_fastest_clock(groups, where, hint)
-        rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
-        notes += [*([f"joints were recorded in {rates}"] if len(groups) > 1 else []), *more]
+        notes += more
     merged = Recording(
         joints,
         _with_unique_names(shifted, [r.points for r in shifted]),

@@ -523,8 +523,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
     yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
     option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
-    step = {"estimate parameters from it": f"solve --set {option} --set 'recordings.held_out=[]'"}
-    yield next_steps_table(result, step)
+    yield next_steps_table(result, {"estimate parameters": f"solve --set {option} --set 'recordings.held_out=[]'"})
 
 
 @SUMMARIES.register("yid-track/1")

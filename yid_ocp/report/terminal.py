@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
 
 TableRows = list[Sequence[str]]
-_MAX_REMEDIES_PER_CAUSE = 3
-_MAX_PLACES = 4  # places of one kind of issue that a sentence names
 _MIN_TABLE_ISSUES = 4  # number of issues from which on a table gives an overview
 _MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
@@ -106,24 +104,18 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
-    for cause, alike in grouped((entry["cause"], entry) for entry in issues).items():
-        words = ISSUE_CAUSE_DESCRIPTIONS[cause]
-        parts = [*grouped(("setting" if own["setting"] else own["advice"], own) for own in alike).values()]
-        last = [entry for part in parts[_MAX_REMEDIES_PER_CAUSE - 1 :] for entry in part]
-        for first, *others in filter(None, [*parts[: _MAX_REMEDIES_PER_CAUSE - 1], last]):
-            places = list(dict.fromkeys(own["where"] for own in (first, *others)))
-            where, do = abbreviated_names_text(places, _MAX_PLACES), first["advice"]
-            rows.append((words, where, first["certainty"]))
-            lines = dict[str, str]()
-            for own in (first, *others):  # the first issue is the strongest; its value of a setting counts
-                lines.setdefault(own["setting"].partition(":")[0], own["setting"])
-            options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
-            do += f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else "."
-            certainty = f" ({first['certainty']})" * (first["certainty"] != "certain")
-            # several places differ in their numbers
-            example = " at the first place," * any(own["what"] != first["what"] for own in others)
-            text = f"{where}{certainty}:{example} {first['what']}. {do[0].upper()}{do[1:]}"
-            advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
+    kinds = grouped(((own["cause"], "" if own["setting"] else own["advice"]), own) for own in issues)
+    for (cause, _), (first, *others) in kinds.items():
+        where = abbreviated_names_text(list(dict.fromkeys(own["where"] for own in (first, *others))))
+        rows.append((ISSUE_CAUSE_DESCRIPTIONS[cause], where, first["certainty"]))
+        lines = dict[str, str]()
+        for own in (first, *others):  # the first issue is the strongest; its value of a setting counts
+            lines.setdefault(own["setting"].partition(":")[0], own["setting"])
+        options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
+        do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else ".")
+        example = " at the first place," * any(own["what"] != first["what"] for own in others)
+        text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
+        advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:

@@ -118,8 +118,7 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
         unknown = next((key for key, own in columns.items() if own == "skip"), "")
         given = ",".join(f"{key}={own}" for key, own in {**columns, unknown: "position:JOINT"}.items())
         has_hint = not unknown or "--columns" in error.hint
-        meanings = "CHANNEL:JOINT (as position:elbow or effort:elbow) or AXIS:POINT (as x:tip)"
-        hint = error.hint if has_hint else f"give columns a meaning, {meanings}: --columns '{given}'"
+        hint = error.hint if has_hint else f"give columns a meaning (also effort:JOINT, x:POINT): --columns '{given}'"
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"
@@ -131,9 +130,8 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> list[st
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
-    kinds = ("warning" if issue.severity == "warning" else "issue" for issue in found)
-    pairs = zip(kinds, found, strict=True)
-    said = [f"{kind} ({issue.certainty_word}): {issue.what}\n  try: {issue.advice}" for kind, issue in pairs]
+    kinds = {"warning": "warning", "not_trusted": "issue", "refused": "issue"}
+    said = [f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n  try: {own.advice}" for own in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
     return [*said, ""] if said else []

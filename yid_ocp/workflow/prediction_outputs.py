@@ -92,7 +92,6 @@ def copyable_estimate_texts(
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
     turning = [joint.name for joint in system.mechanism.joints if joint.kind == "revolute"]
     lines = [_mjcf_joint_line(joint, own, turning) for joint, own in terms.items() if own and joint not in links]
-    kelvin_voigt = {effect.location for effect in system.effects if effect.kind == "kelvin_voigt"}
     for layout in system.segment_layouts:
         for key in ((layout.name, "bend"), (layout.name, "twist")):
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
@@ -101,8 +100,7 @@ def copyable_estimate_texts(
             note = f"{' '.join(key)}, {count} links"
             if stiffness := sizes["stiffness"]:
                 low, high = min(stiffness), max(stiffness)
-                damped = " and the Kelvin-Voigt part of the damping" if layout.name in kelvin_voigt else ""
-                note += f"; for n links, multiply the stiffness{damped} by n/{count}"
+                note += f"; for n links, multiply the stiffness and any Kelvin-Voigt damping by n/{count}"
                 known = {"segment": key[0], "deformation": key[1], "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
@@ -115,7 +113,6 @@ def copyable_estimate_texts(
     offsets = {f"{frame}.{axis}" for frame in system.mechanism.frames for axis in "xyz"}
     quoted = {n: e for n, e in found.items() if n not in offsets} or found
     rows = [rf"{labels[n]} & ${told[n]}$ & {e.unit} \\".replace("±", r"\pm") for n, e in quoted.items()]
-    origin = ", and for flexible objects Caldwell, Coleman and Correll (ISER 2014)" if system.segment_layouts else ""
     return {
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in quoted.items()],
         "uncounted_errors": list(uncounted_errors),
@@ -125,7 +122,7 @@ def copyable_estimate_texts(
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),
-        "cite": f"CITATION.cff of yid_ocp{origin}",
+        "cite": "CITATION.cff of yid_ocp",
     }
 
 

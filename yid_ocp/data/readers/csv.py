@@ -47,7 +47,6 @@ _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _VECTORS for axi
 _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # overhead of a line, in cells
-_LISTED = 5  # numbers of bad lines in a note
 _TIME_STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?")
 
 
@@ -320,10 +319,9 @@ def _read_table(
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
-        (at, why), *others = bad.items()
-        said = f"{len(bad)} of {n_lines} lines are left out, because they are not rows of numbers. In line {at}, {why}"
-        listed = ", ".join(str(line) for line, _ in others[:_LISTED]) + ", ..." * (len(others) > _LISTED)
-        notes = (f"{said}. The others are {listed}" if others else said,)
+        at, why = next(iter(bad.items()))
+        said = f"{len(bad)} of {n_lines} lines are left out, because they are not rows of numbers"
+        notes = (f"{said}. In line {at}, {why}",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
