@@ -37,6 +37,7 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, fit_problem
 from yid_ocp.workflow.build_problem import build_problem
 
@@ -641,7 +642,7 @@ def springs(repository):
     return run, build_problem(run)
 
 
-def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
+def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0, **criteria):
     """Doubts after a fit of the recording on another clock, with a slow error, or another noise in the settings."""
     run, problem = springs
     recording = problem.episodes[0].recording
@@ -650,7 +651,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
     moved = replace(group, t=group.t + late + drift * (group.t - group.t.mean()), position=group.position + error)
     inside = (moved.t >= recording.joints.t[0]) & (moved.t <= recording.joints.t[-1])
     moved = replace(moved, t=moved.t[inside], position=moved.position[inside], std=group.std[inside])
-    options = problem.options
+    options = replace(problem.options, excess_residual_criteria=ExcessResidualCriteria(**criteria))
     if std is not None:
         own = replace(options.sensors.get(group.name, SensorOptions()), std=std)
         options = replace(options, sensors={**options.sensors, group.name: own})
@@ -696,3 +697,4 @@ def test_noise_that_settings_state_ten_times_too_large(springs):
     assert np.isclose(doubt.limit_violation_ratio, 1e-2 / (5 * float(value)), rtol=0.05)
     # what lasts for long counts as what it sums up to
     assert doubts(springs, std=1e-2, slow=2e-3) == []
+    assert doubts(springs, std=1e-2, noise_fraction_of_stated_std=0.1) == [], "the stated noise contains model error"

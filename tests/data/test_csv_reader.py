@@ -233,7 +233,7 @@ def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
     [note] = recording.notes
-    assert all(fact in note for fact in ("left out", "3 of 8 (3, 5, 6)")), note
+    assert all(fact in note for fact in ("left out", "3 of 8 lines", "In line 3")), note
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
     refused(mostly, r"2 of 3 lines are not rows of 2 numbers. .*, the cell 'fast' in", skip_bad_lines=True)
 

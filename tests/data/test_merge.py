@@ -42,7 +42,7 @@ def test_a_shared_clock_is_left_as_it_is_and_said() -> None:
     assert np.array_equal(merged.joints.t, T)
     assert np.array_equal(merged.points[0].t, FRAMES)
     [note] = merged.notes
-    assert all(fact in note for fact in ("robot and camera", "one clock", "18.99 s")), note
+    assert all(fact in note for fact in ("robot and camera", "one clock", "18.99 of 20 s")), note
 
 
 @pytest.mark.parametrize("late", [0.08, 1.5])

@@ -219,7 +219,7 @@ def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
     (doubt,) = estimation._worse_than_baseline_issues([said], UNITS)
-    assert all(fact in doubt.what for fact in ("model", "rms error", "0.2 m", "'stays'", "0.1 m"))
+    assert all(fact in doubt.what for fact in ("model", "rms error", "0.2 m", "'constant readings'", "0.1 m"))
     assert doubt.limit_violation_ratio == pytest.approx(0.2 / 0.105)
 
 
@@ -282,8 +282,9 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
     told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
     assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
-    stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
-    assert ("without the error of the time step):" in stated, "not listed: T1.twist." in lacking) == (True, True)
+    ignored, stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
+    assert ("leaves out the error of the time step." in ignored, "not listed: T1.twist." in lacking) == (True, True)
+    assert stated not in copyable_estimates_blocks({"to_use": rough, "format": "yid-solve/1"}), "its table has them"
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {free: true, initial: 22}"]
     assert told["mjcf"][0].startswith('<joint stiffness="22" damping="0.05"/> <!-- T1 bend, 4 links; for n links, mult')

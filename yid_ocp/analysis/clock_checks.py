@@ -333,6 +333,8 @@ def _by_lateness(
 
 def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[Issue]:
     """Yield issues for groups whose residuals, per sample and summed over time blocks, are far below stated noise."""
+    if problem.options.excess_residual_criteria.noise_fraction_of_stated_std < 1.0:
+        return  # the stated noise contains model error
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
     for series in channels_with_residual_indices(problem):
@@ -352,12 +354,14 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
             continue
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
-        unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        leaves = f"the rms error of {group} (noise and slow errors together) is {seen * usual:.2g} {unit} after the fit"
+        unit, least, size = units[group], QUALITY_LIMITS.max_overstatement_ratio, seen * usual
+        leaves = f"the rms error of {group} (noise and slow errors together) is {size:.2g} {unit} after the fit"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
         advice = "the large std makes every ± too wide, hides small gaps and can end the fit before its error is "
         advice += "smallest. Until this issue is gone, fit again with a smaller std"
-        setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
+        setting = "" if problem.has_process_noise else f"sensors.{group}.std: {size:.2g}"
+        if size < QUALITY_LIMITS.min_noise:
+            advice, setting = "simulate with noise (`yid-ocp simulate --noise`), as no sensor has so little noise", ""
         where = group.partition(".")[0]
         yield Issue("noise_overstated", f"{leaves}, {times}", "warning", severity, advice, "", where, setting=setting)

@@ -14,7 +14,7 @@ from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
-from yid_ocp.display import NULL_PROGRESS, Progress, grouped
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun, grouped
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
@@ -64,7 +64,7 @@ def solve(
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
-    text = f"solving for {len(problem.initial_unknowns)} unknowns by {solver.name}"
+    text = f"solving for {count_with_noun(len(problem.initial_unknowns), 'unknown')} by {solver.name}"
     if problem.options.weighting != "paper":
         noise_cost = limits.noise_fraction_of_stated_std**2 * problem.residual_rows.data.stop / 2
         text += f" (noise alone gives a cost near {noise_cost:.4g})"
@@ -148,7 +148,8 @@ def _checked_solution_and_issues(
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
-    found += _worse_than_baseline_issues(errors, units)
+    if solution.goodness_of_fit.data_trusted:  # wrong data make a model worse than a guess
+        found += _worse_than_baseline_issues(errors, units)
     if any(issue.severity != "warning" for issue in found):
         untrusted = replace(solution.goodness_of_fit, data_trusted=False)
         marked = uncertainty.mark_free_estimates_not_trusted(solution.parameters)
@@ -251,6 +252,12 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
     return float(np.sqrt(total / max(count, 1)))
 
 
+BASELINE_DESCRIPTIONS = {
+    "stays": "constant readings",
+    "zero": "no efforts",
+    "moves_with_clamps": "points move like the mean of the clamps",
+    "linear_carry": "points on lines between the clamps",
+}
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
 _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
 
@@ -359,8 +366,8 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             best = min(rms, key=rms.__getitem__, default="")
             guess, unit = rms.get(best, np.inf), units[channels[0]]
             if error > _WORSE_RATIO * guess:
-                what = f"the rms error of the model is {error:.3g} {unit}, but the guess '{best}' without a model has "
-                what += f"only {guess:.3g} {unit} ({_WORSE_RATIO:g} times is tolerated)"
+                what = f"the rms error of the model is {error:.3g} {unit}, but that of the guess "
+                what += f"'{BASELINE_DESCRIPTIONS[best]}' is {guess:.3g} {unit} ({_WORSE_RATIO:g} times is tolerated)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])

@@ -245,10 +245,8 @@ def slow_motion_excitation_issues(
     size = np.sqrt(np.mean(moving**2 + friction**2, axis=0))
     seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
-        j = int(np.argmax(size / noise))
-        words = f"speed and acceleration require only {size[j]:.2g} N m (rms) at {arm.joint_names[j]}, the best "
-        words += f"joint, but the noise of its effort is {noise[j]:.2g} N m. Over all samples and joints, this signal "
-        words += f"is {seen:.2g} standard deviations of the noise (at least {_MIN_SIGNAL_STDS:g} are needed)"
+        words = "over all samples and joints, the effort that speed and acceleration require is only "
+        words += f"{seen:.2g} standard deviations of the noise (at least {_MIN_SIGNAL_STDS:g} are needed)"
         advice = "move faster, because slow motions do not determine damping, friction and inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
@@ -272,9 +270,8 @@ def joint_excitation_issues(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            least = f"distinguish {', '.join(parameters)} from a constant effort, it must turn by {limit:.2g} rad"
-            words = f"{joint} turns by at most {widest:.2g} rad (in {name}). To {least}"
-            advice, depth = f"turn {joint} further, or fix {' and '.join(parameters)}", limit / max(widest, 1e-9)
+            words = f"{joint} turns by at most {widest:.2g} rad ({', '.join(parameters)} needs {limit:.2g} rad)"
+            advice, depth = "turn the joint further, or fix its parameters", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)
@@ -407,10 +404,8 @@ def _by_joint(data: _Data, fit: _EffortFit) -> Iterator[Issue]:
         off = abs(inverse - 1) / (common * float(fit.std[j]))
         strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
-            words = (
-                f"the effort of {names[j]} is {_ratio_text(usual / inverse)} times what gravity and motion require. "
-            )
-            words += f"The ratio is {off:.3g} of its standard deviations away from {usual:g} ({_MIN_Z:g} are tolerated)"
+            words = f"the effort of {names[j]} is {_ratio_text(usual / inverse)} times what gravity and motion require "
+            words += f"(expected ratio: {usual:g}; 1/{factor:g} to {factor:g} times this is tolerated)"
             advice = "find out the unit and scale of the recorded effort, and on which side of the gear it is measured"
             yield _issue("effort_gain", words, off / _MIN_Z, advice, names[j])
     yield from _offsets(data, fit, told & ~loaded)
@@ -429,14 +424,13 @@ def _ratio_text(ratio: float) -> str:
 
 
 def _signs(arm: RecordedJointsModel, fit: _EffortFit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
-    least, depth = _MIN_Z / 2, -fit.inverse / fit.std / (_MIN_Z / 2)
+    depth = -fit.inverse / fit.std / (_MIN_Z / 2)
     wrong = ((arm.joint_names[j], float(depth[j])) for j in np.flatnonzero(turned))
     cases = [(f"the effort of {name} has", by, name) for name, by in wrong]
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:
-        words = f"{who} the opposite sign of what gravity and motion require. The fitted gain (recorded over required "
-        words += f"effort) is {by * least:.3g} standard deviations below zero ({least:g} are tolerated)"
+        words = f"{who} the opposite sign of what gravity and motion require"
         advice = "multiply the effort in the file by -1, because effort is the motor's torque on the joint"
         yield _issue("effort_sign", words, by, advice, joint)
 

@@ -174,8 +174,8 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         shift = min(late, over) if late > 0 else max(late, over)
         if late * over > 0 and abs(shift) > slack:
             how = f"start {abs(late):.3g} s and end {abs(over):.3g} s {'later' if late > 0 else 'earlier'}"
-            what = f"the times of {group.name} {how} than those of the joints ({slack:.3g} s is tolerated at one end)"
-            advice = "if the clocks differ, import again with --clock-offset FILE=SECONDS (added to the times). "
+            what = f"the times of {group.name} {how} than those of the joints (one end may differ by {slack:.3g} s)"
+            advice = f"if both began together, import again with {-late:+.4g} s more in --clock-offset FILE=SECONDS. "
             advice += "If not, cut out the common time (Python: Recording.time_slice)"
             yield Issue("clock_offset", what, "not_trusted", abs(shift) / slack, advice, "", group.name, "t")
         elif (

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
+from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, median_sample_period
 from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
 from yid_ocp.data.recording import Recording, validated_recording
 from yid_ocp.errors import DataError, require_known_names
@@ -72,8 +72,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
     if groups:
         hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
         joints, more = joints_on_fastest_clock(groups, where, hint)
-        rates = ", ".join(f"{source} at {mean_sample_rate(group.t):.4g} Hz" for source, group in groups)
-        notes += [*([f"joints were recorded in {rates}"] if len(groups) > 1 else []), *more]
+        notes += more
     merged = Recording(
         joints,
         _with_unique_names(shifted, [r.points for r in shifted]),
@@ -98,12 +97,13 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
     for recording in (first, other):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
-    said = f"{first.name} and {other.name} are assumed to have one clock, as their times overlap by {overlap:.4g} s"
+    part = f"their times overlap by {overlap:.4g} of {max(end - begin, stop - start):.4g} s"
+    said = f"{first.name} and {other.name} are assumed to have one clock ({part})"
     if shared:
         late = _late_points(first, other, other.name, 0.0)
         if late:
             return 0.0, f"{said}, so nothing was shifted. But {late}"
-        return 0.0, f"{said}. If they have two clocks, import again with --clock-offset {other.name}=SECONDS (added)"
+        return 0.0, f"{said}. If not, import again with --clock-offset {other.name}=SECONDS, added to its times"
     best = _motion_lag(first, other, begin - start)
     if best is None or not best.is_clear:
         spans = f"{first.name}: {begin:.10g} to {end:.10g} s, {other.name}: {start:.10g} to {stop:.10g} s"

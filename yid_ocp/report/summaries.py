@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.analysis.estimation import BASELINE_DESCRIPTIONS, channel_or_group_unit
 from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
@@ -42,12 +42,6 @@ from yid_ocp.report.terminal import (
     value_text_and_display_unit,
 )
 
-_BASELINE_DESCRIPTIONS = {
-    "stays": "constant readings",
-    "zero": "no efforts",
-    "moves_with_clamps": "points move like the mean of the clamps",
-    "linear_carry": "points on lines between the clamps",
-}
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
 _HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
@@ -77,11 +71,12 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
-        said = f"Do not use the values, because {said}: {result['message'].removesuffix('.')}."
-        said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
         chi2 = 0.0 if failed else result["fit"]["chi2_per_dof"] or 0.0
-        if chi2 > _HOPELESS_CHI2:
-            said += f" With {chi2:.3g} times the chi2 of noise, first check units, signs and names."
+        is_hopeless = chi2 > _HOPELESS_CHI2
+        why = result["message"].partition(". Set solver.")[0] if is_hopeless else result["message"]
+        said = f"Do not use the values, because {said}: {why.removesuffix('.')}."
+        said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
+        said += f" With {chi2:.0f} times the chi2 of noise, first check units, signs and names." * is_hopeless
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
@@ -175,7 +170,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Yield held-out errors of each shown channel and recording, by the model, noise alone and baselines."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     named = list(dict.fromkeys(name for entry in result["held_out"] for name, own in entry["baselines"].items() if own))
-    guesses = (f"without model: {_BASELINE_DESCRIPTIONS.get(name, name)}" for name in named)
+    guesses = (f"without model: {BASELINE_DESCRIPTIONS.get(name, name)}" for name in named)
     rows: TableRows = [("recording", "channel", "model", "noise alone", *guesses, "unit")]
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
@@ -527,8 +522,8 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(said, "verdict")
     rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
     yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
-    option = f"recordings.estimate=[{result.get('file', 'recording.h5')}]"
-    yield next_steps_table(result, {"estimate parameters from this recording": f"solve --set {shlex.quote(option)}"})
+    option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
+    yield next_steps_table(result, {"estimate parameters": f"solve --set {option} --set 'recordings.held_out=[]'"})
 
 
 @SUMMARIES.register("yid-track/1")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from yid_ocp.data.readers import FilePreview
 
 TableRows = list[Sequence[str]]
-_MAX_REMEDIES_PER_CAUSE = 3
+_MIN_TABLE_ISSUES = 4  # number of issues from which on a table gives an overview
 _MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
 _MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
@@ -51,6 +51,7 @@ class SummaryTable:
     title: str = ""
     is_key_table: bool = False  # whether a page shows it next to the verdict
     is_page_only: bool = False  # whether a terminal omits it
+    is_list: bool = False  # whether a terminal shows the second of two columns below the first
     links: Mapping[str, str] = field(default_factory=dict)  # linked page by the text of a cell in the first column
 
 
@@ -99,28 +100,27 @@ def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
 
 
 def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True) -> SummaryBlockOrTextIterator:
-    """Yield the issues of the recordings in a result as a table, with advice and settings for each cause."""
+    """Yield the issues in a result with numbers, advice and settings for each cause, and a table if there are many."""
     issues = result.get("issues", ())
     rows: TableRows = [("issue", "where", "is it an error?")]
     advice: list[StatementTableOrCode | str] = []
-    for cause, alike in grouped((entry["cause"], entry) for entry in issues).items():
-        words = ISSUE_CAUSE_DESCRIPTIONS[cause]
-        parts = [*grouped(("setting" if own["setting"] else own["advice"], own) for own in alike).values()]
-        last = [entry for part in parts[_MAX_REMEDIES_PER_CAUSE - 1 :] for entry in part]
-        for first, *others in filter(None, [*parts[: _MAX_REMEDIES_PER_CAUSE - 1], last]):
-            where, do = first["where"] + f" and {len(others)} more" * bool(others), first["advice"]
-            rows.append((words, where, first["certainty"]))
-            # the first issue is the strongest; its line counts if others give the same setting another value
-            lines = {own["setting"].partition(":")[0]: own["setting"] for own in (*others[::-1], first)}
-            options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
-            do += f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else "."
-            text = f"{words}{f' ({where})' * (len(alike) > 1)}: {first['what']}. {do[0].upper()}{do[1:]}"
-            advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
+    kinds = grouped(((own["cause"], "" if own["setting"] else own["advice"]), own) for own in issues)
+    for (cause, _), (first, *others) in kinds.items():
+        where = abbreviated_names_text(list(dict.fromkeys(own["where"] for own in (first, *others))))
+        rows.append((ISSUE_CAUSE_DESCRIPTIONS[cause], where, first["certainty"]))
+        lines = dict[str, str]()
+        for own in (first, *others):  # the first issue is the strongest; its value of a setting counts
+            lines.setdefault(own["setting"].partition(":")[0], own["setting"])
+        options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
+        do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else ".")
+        example = " at the first place," * any(own["what"] != first["what"] for own in others)
+        text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
+        advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
         yield f"Before you use values, follow the advice below on these issues, which the verdicts leave out: {mild}."
-    yield SummaryTable(rows, "Issues of the recordings")
+    yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 
 
@@ -132,7 +132,7 @@ def next_steps_table(result: Mapping[str, Any], steps: Mapping[str, str]) -> Sum
     for purpose, text in steps.items():
         command, _, options = text.partition(" ")
         rows.append((purpose, " ".join(filter(None, ("yid-ocp", command, config, options)))))
-    return SummaryTable(rows, "Next steps")
+    return SummaryTable(rows, "Next steps", is_list=True)
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
@@ -142,13 +142,14 @@ def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield the found values of a result to copy, as text, YAML, MJCF and LaTeX. Nothing if none is found."""
+    """Yield the found values of a result to copy, as text (except after `solve`), YAML, MJCF and LaTeX."""
     if use := result.get("to_use"):
-        ignored = " and ".join(use["uncounted_errors"])
-        yield f"Values to use (± is one standard deviation{f', without the error {ignored}' if ignored else ''}):"
-        yield CodeBlock("\n".join(use["values"]))
-        lost = abbreviated_names_text(use.get("left_out", ()))
-        yield f"Too uncertain, so not listed: {lost}." if lost else ""
+        ignored, lost = " and ".join(use["uncounted_errors"]), abbreviated_names_text(use.get("left_out", ()))
+        yield f"The ± leaves out the error {ignored}." if ignored else ""
+        if result.get("format") != "yid-solve/1":  # whose table has the values
+            yield "Values to use (± is one standard deviation):"
+            yield CodeBlock("\n".join(use["values"]))
+            yield f"Too uncertain, so not listed: {lost}." if lost else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():
@@ -248,7 +249,9 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
     for block in blocks:
         if isinstance(block, SummaryTable):
             above = [""] * bool(result and result[-1]) + [f"{block.title}:"] * bool(block.title)
-            result += [] if block.is_page_only else [*above, *aligned_table_lines(block.rows), ""]
+            listed = (line for first, second in block.rows[1:] for line in (f"{first}:", f"  {second}"))
+            lines = listed if block.is_list else aligned_table_lines(block.rows)
+            result += [] if block.is_page_only else [*above, *lines, ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         else:
@@ -257,14 +260,14 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 
 def recording_summary_lines(recording: Recording) -> list[str]:
-    """Return lines of text that describe a recording: a table of its groups, the duration and notes."""
-    rows: TableRows = [("group", "samples", "rate [Hz]", "longest gap [s]", "length [s]", "channels", "names")]
+    """Return lines of text that describe a recording: a table of its groups, and notes."""
+    rows: TableRows = [("group", "samples", "mean rate [Hz]", "longest gap [s]", "length [s]", "channels", "names")]
     for group in recording.all_groups:
         rate, gap, span = mean_sample_rate(group.t), np.diff(group.t).max(initial=0.0), group.t[-1] - group.t[0]
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", f"{gap:.3g}", f"{span:.4g}"
         names = abbreviated_names_text(group.names, math.inf)
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
-    return [*aligned_table_lines(rows), "", f"duration: {recording.duration:g} s", *_note_lines(recording.notes)]
+    return [*aligned_table_lines(rows), *_note_lines(recording.notes)]
 
 
 def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:

@@ -386,7 +386,8 @@ def _raise_for_issues(run: RunSettings, issues: Sequence[Issue]) -> None:
 
 
 def _gravest_first(issues: Sequence[Issue]) -> list[Issue]:
-    return sorted(issues, key=lambda issue: (issue.severity == "warning", -issue.limit_violation_ratio))
+    # an issue of all joints explains those of single ones
+    return sorted(issues, key=lambda own: (own.severity == "warning", "." in own.channel, -own.limit_violation_ratio))
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from yid_ocp.analysis import discretisation, step_diagnostics
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.channel_checks import median_sample_period
+from yid_ocp.data.channel_checks import QUALITY_LIMITS, median_sample_period
 from yid_ocp.display import Progress, abbreviated_names_text, count_with_noun
 from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
@@ -36,7 +36,6 @@ from yid_ocp.workflow.run_inputs import input_files_by_name
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
-_LEAST_POINT_NOISE = 1e-6  # [m]
 _STIFFNESS_UNITS = ("N m^2", "N m/rad", "N/m")
 
 
@@ -120,7 +119,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         if arm is not None and group == joints.JOINT_EFFORT_SENSOR_KEY:
             choice, names = problem.options.sensors.get(group, SensorOptions()), samples.sensor.effort_joints
             noise[group]["recorded_std"] = float(np.median(noise_std_of(arm, names, choice, episode.name)))
-        if known.size and samples.sensor.unit == "m" and np.median(known) < _LEAST_POINT_NOISE:
+        if known.size and samples.sensor.unit == "m" and np.median(known) < QUALITY_LIMITS.min_noise:
             size = f"{1e3 * np.median(known):.2g} mm"
             said = f"the stated noise of {group} is {size}, less than any sensor of points has. "
             said += f"Set sensors.{group}.std to that of your sensor [m]"

@@ -485,7 +485,7 @@ def _near(
         rounded = _POSITION_STEP_PERCENT * round((100 * part if math.isnan(exact) else exact) / _POSITION_STEP_PERCENT)
         percent = round(exact, 2) if abs(exact - rounded) > _MAX_ROUNDED_PERCENT else rounded
         why = f"its distance from {holder} is at most {part:.0%} of the length"
-        why += " (beyond the end, so check length, frame and clocks)" if part > 1.05 else ""
+        why += ". That is too far: check --length, --holder and the clocks" * (part > 1.05)
         return _along(branch.name, min(100, percent)), why
     local = poses[0, :3, :3].T @ from_holder[0]
     apart = {name: float(np.linalg.norm(local - spot)) for name, spot in _straight(branches).items()}

@@ -61,8 +61,9 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     out, issues = arguments.out, recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
     then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
-    then = f"{out} has the values as read: do not use it before the advice above is followed" if issues else then
-    lines = [*recording_summary_lines(recording), *issues, "", *replaced, then]
+    if any(line.startswith("issue") for line in issues):
+        then = f"{out} has the values as read: do not use it before the advice above is followed"
+    lines = [*issues, *recording_summary_lines(recording), "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
 
@@ -117,22 +118,23 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
         unknown = next((key for key, own in columns.items() if own == "skip"), "")
         given = ",".join(f"{key}={own}" for key, own in {**columns, unknown: "position:JOINT"}.items())
         has_hint = not unknown or "--columns" in error.hint
-        hint = error.hint if has_hint else f"give columns a meaning, as in --columns '{given}'"
+        hint = error.hint if has_hint else f"give columns a meaning (also effort:JOINT, x:POINT): --columns '{given}'"
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"
-    return [*recording_issue_lines(recording), "", f"to import {what}:", f"  {_import_command_line(files, options)}"]
+    return ["", *recording_issue_lines(recording), f"to import {what}:", f"  {_import_command_line(files, options)}"]
 
 
 def recording_issue_lines(recording: Recording, more_flags: str = "") -> list[str]:
-    """Return lines about the issues of a recording that show without a model: units, clocks, few samples, no motion."""
+    """Return lines about the issues of a recording that show without a model. Lines on severe ones begin with issue."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
-    said = [f"issue ({issue.certainty_word}): {issue.what}\n  try: {issue.advice}" for issue in found]
+    kinds = {"warning": "warning", "not_trusted": "issue", "refused": "issue"}
+    said = [f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n  try: {own.advice}" for own in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
-    return ["", *said] if said else []
+    return [*said, ""] if said else []
 
 
 def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) -> Recording:

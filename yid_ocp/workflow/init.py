@@ -11,7 +11,6 @@ import shlex
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +26,6 @@ from yid_ocp.model.objects.base import InitialObjectSettings, object_factories_f
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import class_options_by_key
-from yid_ocp.problem.recorded_inputs import effect_kinds_by_missing_signals
 from yid_ocp.report.animation import measured_motion_animation
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
@@ -209,32 +207,27 @@ def _summary_lines(
         (f"frame of the {carried}", ", ".join(held), f"other choices for --holder: {', '.join(others)}" * bool(others)),
         ("model.arms.mode", proposal.arm_mode, proposal.arm_mode_reason),
         ("problem.initial_state", proposal.initial_state, proposal.initial_state_reason),
-        ("model.damping", f"{_value(proposal.urdf_joint_damping)} N m s/rad", "as the robot file states"),
     ]
-    lines = aligned_table_lines(rows if proposal.urdf_joint_damping else rows[:-1])
+    if damping := proposal.urdf_joint_damping:
+        reason = f"of {abbreviated_names_text([*damping], math.inf)}, as the robot file states"
+        rows.append(("model.damping", f"{_number_or_numbers_by_name(damping)} N m s/rad", reason))
+    lines = aligned_table_lines(rows)
     told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
-    lost = [f"warning: {text}" for text in told if "`init` leaves out" in text]
+    lost = [f"warning: {text}" for text in told if "`init` leaves out" in text or "too far" in text]
     for group, own in proposal.point_placements.items() if proposal.has_object else ():
         if "." not in group and own and {place.frame for place in own} <= {"", proposal.holder_frame}:
             frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
-            lost.append(
-                f"warning: no point of {group} is on the object (without a frame, `check` stops). Set {frames} or {use}"
-            )
+            lost.append(f"warning: no point of {group} is on the object, so `check` would stop. Set {frames} or {use}")
     where = f" in the picture {out.with_suffix('.html')}" * has_picture
     head = f"`init` chose these settings. Check them{where}:"
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
-    if kinds := list(chain.from_iterable(effect_kinds_by_missing_signals(recordings).values())):
-        lines.append(f"`diagnose` skips effects that no signal shows (matters if you expect one): {', '.join(kinds)}.")
-    has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
-    is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
-    unseen = "Recorded torques are not used, because the object's parameters are estimated without them. To let "
-    unseen += "`diagnose` find friction and payload of the arm too, set sensors.joints.effort.use: true."
-    lines += [*[unseen] * is_left_out, "", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
-    if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
-        more = " --set sensors.joints.effort.use=true" if is_left_out else ""
-        lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
-    return [*lines, ""]
+    quoted = shlex.quote(str(out))
+    return [
+        *lines,
+        "",
+        f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}",
+    ]
 
 
 def _place_sentences(places: Iterable[Any]) -> list[str]:

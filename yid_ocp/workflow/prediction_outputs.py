@@ -97,9 +97,10 @@ def copyable_estimate_texts(
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
             sizes = {term: [at[term] for at in own if term in at] for term in ("stiffness", "damping")}
             count = len(layout.link_joints)
-            note = f"{' '.join(key)}, {count} links; for n links, multiply the stiffness by n/{count}"
+            note = f"{' '.join(key)}, {count} links"
             if stiffness := sizes["stiffness"]:
                 low, high = min(stiffness), max(stiffness)
+                note += f"; for n links, multiply the stiffness and any Kelvin-Voigt damping by n/{count}"
                 known = {"segment": key[0], "deformation": key[1], "links": count}
                 joints.append(known | {"lowest": low, "highest": high})
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
@@ -121,7 +122,7 @@ def copyable_estimate_texts(
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),
-        "cite": "CITATION.cff of yid_ocp, and Caldwell, Coleman and Correll (ISER 2014) for the problem",
+        "cite": "CITATION.cff of yid_ocp",
     }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -75,8 +75,7 @@ def solve_and_choose_cable_shape_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> tuple[EstimationProblem, Solution]:
     """Fit with the run's solver, for a cable with or without its shape memory. Returns the chosen problem and fit."""
-    unknowns = count_with_noun(len(problem.initial_unknowns), "unknown")
-    progress.begin_stage(f"solving for {unknowns} by {run.solver.name}")
+    progress.begin_stage(f"solving by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
     return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)[:2]

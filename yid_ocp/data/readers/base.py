@@ -222,18 +222,18 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
         widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
         if widest > _MAX_PLAUSIBLE_VALUES["position"]:
             units["position"] = "deg"
-            notes.append(f"angles reach {widest:.3g}, so they seem to be in degrees")
+            notes.append(f"angles would reach {widest:.3g} rad, so they seem to be in degrees")
     farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
     if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
-        notes.append(f"coordinates of points reach {farthest:.3g}, so they seem to be in millimetres")
+        notes.append(f"coordinates of points would reach {farthest:.3g} m, so they seem to be in millimetres")
     for group in recording.joint_and_point_groups:
         period = median_sample_period(group.t)
         unit = next((unit for unit, least in (("ns", 1e4), ("us", 200.0), ("ms", 0.5)) if period > least), "")
         slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds
         if unit and not slow and "t" not in units:
             units["t"] = unit
-            notes.append(f"the time between samples is {period:.3g}, so the times seem to be in {unit}")
+            notes.append(f"the time between samples would be {period:.3g} s, so the times seem to be in {unit}")
     return units, tuple(notes)
 
 

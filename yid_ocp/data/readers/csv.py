@@ -47,7 +47,6 @@ _COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _VECTORS for axi
 _MOST_BAD = 0.5  # fraction of bad lines above which the table is refused
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # overhead of a line, in cells
-_LISTED = 5  # numbers of bad lines in a note
 _TIME_STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?")
 
 
@@ -223,9 +222,9 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     sources, second = [], base.factor_to_si_by_quantity({**units, **dict(stated)}, str(path))["t"]
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
-        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "left out, its meaning is unknown"
+        becomes = ":".join(filter(None, meaning or ()))
         rate = mean_sample_rate(second * t[np.isfinite(column + t)]) if ok else math.nan
-        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes, note))
+        sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes))
     return base.FilePreview(tuple(sources), options, (*notes, *(reason for _, reason in guessed)))
 
 
@@ -320,9 +319,9 @@ def _read_table(
         raise DataError(what, where=where, allowed=f"at most {_MOST_BAD:.0%} of the lines", hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
-        listed = ", ".join(map(str, [*bad][:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        said = f"lines left out, because they are not rows of numbers: {len(bad)} of {n_lines} ({listed})"
-        notes = (f"{said}. In line {next(iter(bad))}, {next(iter(bad.values()))}. All other lines are used",)
+        at, why = next(iter(bad.items()))
+        said = f"{len(bad)} of {n_lines} lines are left out, because they are not rows of numbers"
+        notes = (f"{said}. In line {at}, {why}",)
     return [meaning for meaning in meanings if meaning], units, table, notes
 
 
