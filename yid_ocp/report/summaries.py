@@ -457,7 +457,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     elif is_advised:
         ended = f"`solve` can run, but values may be wrong. First read the {'issues' if mild else 'warnings'} below."
     elif coarse:
-        ended = "`solve` can run. It tests whether the coarse simulation (warnings below) changes the estimates."
+        ended = "`solve` can run. The simulation may be too coarse (warnings below)."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     yield from issue_summary_blocks(result, with_verdict=False)
@@ -471,17 +471,20 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for name, group in entry["groups"].items():
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
             rows.append((entry["recording"], use, name, *taken))
-        for cells in _noise_cells(entry["noise"]):
+    alike = dict[str, list[str]]()  # names of the recordings by warning
+    for text in (*coarse, *warnings):
+        name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
+        alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
+    texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
+    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
+        for cells in _noise_cells(entry["noise"], entry.get("noise_fraction", 1.0)):
             noise.setdefault(cells, []).append(entry["recording"])
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
         apart.setdefault(", ".join(gaps), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
-    rows = [("channel", "noise (std)", "constant error (std)", "source", "recordings")]
+    rows = [("channel", "noise (std; of points: per axis)", "constant error (std)", "source", "recordings")]
     rows += [(*cells, ", ".join(own) * (len(own) < len(result["recordings"]))) for cells, own in noise.items()]
     yield SummaryTable(rows, "Noise of the readings")
-    share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
-    said = f"A fit takes {1 / share:.3g} times this noise as the std of readings, to allow for errors of the model."
-    yield f"{said} This is set by diagnosis.noise_fraction_of_stated_std and no fault." if share < 1 else ""
     told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
     yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
@@ -491,26 +494,19 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for row in convergence[key]:
             hertz = [f"{f:.4g}" for f in row["hertz"]]
             rows.append((f"{row['value']:g}", *hertz, *[""] * (count - len(hertz)), row["message"]))
-        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}")
+        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}", is_page_only=True)
     yield convergence["message"]
-    yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    alike = dict[str, list[str]]()  # names of the recordings by warning
-    for text in warnings:
-        name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
-        alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
-    texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
-    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] and not severe else {})
 
 
-def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield channel, std of its noise, std of a constant error and source of the noise, as table cells."""
+def _noise_cells(noise: Mapping[str, Any], share: float) -> Iterator[Sequence[str]]:
+    """Yield channel, std of its noise (`share` of the stated one), std of a constant error and source, as cells."""
     for channel, known in noise.items():
         std, offset = (" ".join(value_text_and_display_unit(known.get(k), known["unit"])) for k in ("std", "bias_std"))
         source = "estimated" if known.get("estimated") else "stated"
         recorded = known.get("recorded_std")
-        if recorded is not None and not math.isclose(recorded, known["std"] or 0.0, rel_tol=0.01):
+        if recorded is not None and not math.isclose(recorded, stated or 0.0, rel_tol=0.01):
             size = " ".join(value_text_and_display_unit(recorded, known["unit"]))
             source += f" {size}, low-pass filtered, with the noise of the angles"
         if known["std"] is not None:
@@ -519,6 +515,11 @@ def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 @SUMMARIES.register("yid-simulate/1")
 def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+        stated = known["std"]
+        if share < 1 and stated is not None and "estimated" not in known:  # readings, not inputs
+            stated /= share
+            size = " ".join(value_text_and_display_unit(stated, known["unit"]))
+            source = f"{share:g} times the stated {size} (diagnosis.noise_fraction_of_stated_std)"
     if result["status"] == "failed":
         said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
         yield SummaryStatement(said, "verdict")
