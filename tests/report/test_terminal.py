@@ -94,7 +94,8 @@ def test_a_solve_says_what_is_not_found():
         ("p_at_bound", "lower", "2", solved()), ("p", "upper", "9", solved(parameters=poor, fit=BAD))
     ):  # fmt: skip
         said = " ".join(" ".join(told("yid-solve/1", result)).split())
-        assert f"{name} ended at the {side} bound of {bound} N m/rad, so values beyond it were not tried and" in said
+        rest = ". Widen" if name == "p" else ", so values beyond it were not tried and"
+        assert f"{name} ended at the {side} bound of {bound} N m/rad{rest}" in said
         assert f"Widen parameters.{name}.bounds, or" in said
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
     assert "Fix p there (parameters.p.free: false) if it is absent" in " ".join(gone.split())
@@ -127,17 +128,23 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     said = solved(fit=BAD, parameters={"a": parameter("not_trusted")})
     first = "Do not use the values yet, because the model does not explain the recordings (chi2 per degree of freedom "
     first += "is 41.7; noise alone gives 1). To find the cause, check the stated noise and run `yid-ocp diagnose`."
-    # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     lines = told("yid-solve/1", said)
-    sure = "Until then, treat these values as rough: a. Their ± is at most 10 % and includes the model error. "
-    sure += "They are in doubt, as an effect that the model lacks can shift them further."
-    assert [" ".join(lines[:3]), " ".join(lines[3:5])] == [first, sure]
+    # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
+    sure = "Until then, take these values as rough: a. Their ± includes the error of the model."
+    assert (" ".join(lines[:3]), lines[3]) == (first, sure)
     for std, data in ((0.21, BAD), (0.1, BAD | {"data_trusted": False})):
         unsure = solved(fit=data, parameters={"a": parameter("not_trusted") | {"std": std}})
         assert "as rough" not in " ".join(told("yid-solve/1", unsure))
     lost = {"k": parameter("not_identifiable", 1.29e6) | {"initial": 1.3e6}, "b": parameter("not_identifiable")}
-    text = " ".join(told("yid-solve/1", solved(fit=BAD, parameters=lost)))
-    assert "First check size and unit of the start values of k (1.3e+06 N m/rad): there the recordings" in text
+    for name, fraction in (("k", 1.0), ("b", 0.1)):
+        still = {"cause": "weak_excitation", "setting": f"parameters.{name}.free: false", "where": "", "certainty": ""}
+        issues = [still | {"severity": "warning", "advice": "fix it", "what": ""}]
+        fit = BAD | {"noise_fraction": fraction}
+        text = " ".join(told("yid-solve/1", solved(fit=fit, parameters=lost, issues=issues)))
+        assert ("start values of k (1.3e+06 N m/rad): near them" in text) == (name == "b"), "k does not move"
+        assert ("noise alone, 0.1 times the stated std, gives 1" in text) == (fraction < 1)
+        unknown = "A better model may find what cannot be found now." in text
+        assert (unknown, "do not determine" in text, "--what-if" in text) == (True, False, False)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in " ".join(lines[:7])
     assert "The model does not explain the recordings, so agreement of methods does not confirm the values." in lines
@@ -187,11 +194,14 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
-    said = "Twice the links would change these estimates by more than their ± from noise: p.a by -5.5 (± 0.073)."
-    rest = "Half the time step would change no estimate by more than its ± from noise."
+    said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
+    rest = "Half the time step would change no estimate by more than its ±."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "For a smaller ±, set model.object.links: 8, and solve again."
-    assert lines[at + 1 : at + 4] == ["The ± of the table includes this.", rest, cure]
+    assert lines[at + 1 : at + 4] == ["includes this.", rest, cure]
+    again = lines[lines.index("estimate again with the finer model:") + 1]
+    assert again.endswith("--set model.object.links=8")
+    assert rest not in told("yid-solve/1", solved(discretisation=moved, fit=BAD)), "it says nothing of a wrong model"
     noisy = {name: own | {"links": None, "encoder_noise": 0.01} for name, own in moved.items()}
     ends = [" ".join(told("yid-solve/1", solved(discretisation=noisy, status=s))) for s in ("converged", "stalled")]
     assert [("or additional noise of the joint" in end, "twice the links" in end) for end in ends] == [(1, 0), (0, 0)]

@@ -26,6 +26,7 @@ ConfidenceInterval = tuple[float | None, float | None]
 
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
+HOPELESS_CHI2 = 1e3  # per degree of freedom: units, signs or names are probably wrong
 # A standard deviation of this many times the value (or its typical size) counts as infinite.
 MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
 # A value this close to its bound, in units of the unknown's typical size, counts as at the bound.
@@ -52,6 +53,7 @@ class GoodnessOfFit:
     p_value: float  # probability of a chi2 this large under noise alone
     explains: bool  # result of the null test (`residuals_exceed_noise`)
     data_trusted: bool = True  # no serious data issue (`ProblemOptions.data_issues`)
+    noise_fraction: float = 1.0  # of the stated standard deviations
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,9 +114,10 @@ def assess_goodness_of_fit(
         residual = np.concatenate(parts)
     series = null_test.channels_with_residual_indices(problem)
     fitted = effective_parameter_count(problem, evaluation)
-    found = null_test.residual_chi2_null_test(series, residual / limits.noise_fraction_of_stated_std, fitted)
+    share, is_trusted = limits.noise_fraction_of_stated_std, problem.options.has_no_data_issue_above_warning
+    found = null_test.residual_chi2_null_test(series, residual / share, fitted)
     explains = not null_test.residuals_exceed_noise((found,), limits)
-    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_data_issue_above_warning)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, is_trusted, share)
 
 
 def null_tests_of_fit(
@@ -474,15 +477,19 @@ VERDICT_TABLE_TEXTS: Mapping[str, str] = {
 """Words for each verdict of a parameter."""
 
 
-def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value: float | None = None) -> str:
+def goodness_of_fit_message(fit: Mapping[str, Any]) -> str:
     """Return a sentence that states whether a model explains its recordings, with advice for a poor fit.
 
+    `fit` has the attributes of a `GoodnessOfFit`; `p_value` and `noise_fraction` may be missing.
     A fit with more error than noise alone usually leaves is not called within noise, even if it is not significant.
     """
+    chi2_per_dof, explains, p_value = fit["chi2_per_dof"], fit["explains"], fit.get("p_value")
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "It is not known whether the model explains the recordings."
     chi2 = f"{chi2_per_dof:.3g}" if chi2_per_dof < 1000 else f"{chi2_per_dof:.0f}"
-    size = f"chi2 per degree of freedom is {chi2}; noise alone gives 1"
+    fraction = fit.get("noise_fraction", 1.0)
+    share = f", {fraction:g} times the stated std," if fraction < 1 else ""
+    size = f"chi2 per degree of freedom is {chi2}; noise alone{share} gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
         chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
         said = "The errors are larger than noise usually leaves them, so the model may lack a small effect"
@@ -491,7 +498,8 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool, p_value:
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    return f"{said} To find the cause, check the stated noise and run `yid-ocp diagnose`."
+    what = "units, signs and names" if chi2_per_dof * fraction**2 > HOPELESS_CHI2 else "the stated noise"
+    return f"{said} To find the cause, check {what} and run `yid-ocp diagnose`."
 
 
 def overstated_noise_sentence(chi2_per_dof: float, p_value: float | None) -> str:

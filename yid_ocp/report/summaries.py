@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +14,7 @@ from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
+    HOPELESS_CHI2,
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
@@ -44,7 +46,6 @@ from yid_ocp.report.terminal import (
 
 _MAX_DIRECTIONS = 4  # combinations of parameters that `identifiability` lists; result.json has all
 _MIN_NAMED_SHARE, _MAX_CHANGES = 0.1, 4  # of a combination: named parts over the largest one, and their number
-_HOPELESS_CHI2 = 1e3  # per degree of freedom of a fit that did not converge: more iterations alone do not help
 _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs no words [m]
 
 
@@ -56,23 +57,25 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
-        fit, notes = result["fit"], result.get("discretisation_notes", ())
-        yield from misfit_summary_blocks(result, free, any("First set " in note for note in notes))
-        notes = (*notes, *_bound_sentences(free))
-        gaps = [*_gap_sentences(result)] if fit["explains"] else []
-        is_safe = fit["explains"] and not notes and not gaps
-        causes = grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
-        said = goodness_of_fit_message(fit["chi2_per_dof"], True, fit["p_value"]) if fit["explains"] else ""
-        if said and "noise_overstated" in causes:
-            said = "The stated noise is too large to test whether the model explains the recordings."
-        still = " ".join(causes.get("weak_excitation", ()))
-        found, doubts = (*_found_and_lost(free, is_safe, mild, still), said), (*notes, *gaps)
-        texts = (*found, *doubts) if is_safe else (*doubts, *found)
+        fit = result["fit"]
+        yield from misfit_summary_blocks(result, free)
+        texts = [*result.get("discretisation_notes", ()), *_bound_sentences(free, fit["explains"])]
+        if fit["explains"]:
+            texts += _gap_sentences(result)
+            is_safe = not texts
+            said = goodness_of_fit_message(fit)
+            causes = grouped((own["cause"], own["setting"] or "") for own in result.get("issues") or ())
+            if "noise_overstated" in causes:
+                said = "The stated noise is too large to test whether the model explains the recordings."
+            still = " ".join(causes.get("weak_excitation", ()))
+            texts += [*_found_and_lost(free, is_safe, mild, still), said]
+        elif _names_by_verdict(free)["not_identifiable"]:
+            texts += ["The ± includes the error of the model. A better model may find what cannot be found now."]
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
         chi2 = 0.0 if failed else result["fit"]["chi2_per_dof"] or 0.0
-        is_hopeless = chi2 > _HOPELESS_CHI2
+        is_hopeless = chi2 > HOPELESS_CHI2
         why = result["message"].partition(". Set solver.")[0] if is_hopeless else result["message"]
         said = f"Do not use the values, because {said}: {why.removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
@@ -83,7 +86,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     heads = ("value" if converged else "last value", "± (std)", "95 % interval", "unit", "verdict", "bounds")
     rows: TableRows = [("parameter", *heads, "meaning")]
     for name, entry in free.items():
-        verdict, value = entry["verdict"] if converged else "", value_and_uncertainty_text(entry["value"], None)
+        verdict = entry["verdict"] if converged else ""
+        value = value_and_uncertainty_text(entry["value"], entry["std"], least_digits=2).partition(" ±")[0]
         std = "infinite" if verdict == "weak" else ""
         if entry["std"] is not None:
             std = f"{entry['std']:.2g}"
@@ -93,11 +97,13 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
         more = (shown_unit(entry["unit"]), said, bound_range_text(entry, 4), entry.get("meaning", ""))
         rows.append((name, value, std, interval, *more))
-    yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True)
+    is_useless = not (converged or is_trusted)
+    yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True, is_page_only=is_useless)
     rows = [("channel", "error", "unit", "samples")]
     for name, entry in result["residuals"].items():
         rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
-    yield SummaryTable(rows, "Errors (rms) on the fitted recordings")
+    has_others = any(entry["rmse"] for entry in result["held_out"])
+    yield SummaryTable(rows, "Errors (rms; of points: distance) on the fitted recordings", is_page_only=has_others)
     yield from _held_out_blocks(result)
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
@@ -106,26 +112,29 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
-    yield next_steps_table(result, _steps_after_solve(result, free) if converged else {})
+    yield next_steps_table(result, _steps_after_solve(result, free))
     which = "chosen fit" if result.get("safeguard") else "fit"
     yield f"End of the {which}: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return the commands that help after a converged fit, by purpose."""
-    lost, notes = _names_by_verdict(free)["not_identifiable"], " ".join(result.get("discretisation_notes", ()))
-    finer = [text for text in result.get("finer_settings", {}).values() if f"First set {text}," in notes]
+    """Return the commands that help after a fit, by purpose."""
+    if result["status"] != "converged":
+        asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
+        return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
+    lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
+    told = " ".join((*result.get("discretisation_notes", ()), *discretisation_shift_sentences(result)))
+    finer = [text for text in result.get("finer_settings", {}).values() if text in told]
     options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
-    if not result["fit"]["data_trusted"]:
-        steps["estimate again, after the advice above is followed"] = "solve"
-        if any("yid-ocp diagnose" in own["advice"] for own in result.get("issues", ())):
-            steps["find what the model lacks, as advised above"] = "diagnose"
-    elif not result["fit"]["explains"]:
+    if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
+        steps["find what the model lacks, as advised above"] = "diagnose"
+    steps |= {"estimate again, after the advice above is followed": "solve"} if issues else {}
+    if result["fit"]["data_trusted"] and not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
-    elif len(lost) < len(free):
+    elif result["fit"]["data_trusted"] and len(lost) < len(free):
         steps["test whether the model lacks an effect"] = "diagnose"
-    if lost:
+    if lost and result["fit"]["explains"]:
         steps["rank experiments that determine the missing parameters (takes minutes)"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
@@ -176,19 +185,18 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for channel in _shown_channels(entry["rmse"]):
             unit, noise = channel_or_group_unit(units, channel), entry.get("expected", {}).get(channel)
             errors = (entry["rmse"][channel], noise, *(entry["baselines"].get(name, {}).get(channel) for name in named))
-            cells = ("" if error is None else value_text_and_display_unit(error, unit)[0] for error in errors)
+            cells = (value_text_and_display_unit(error, unit)[0] for error in errors)
             rows.append((entry["recording"], channel, *cells, scale_and_unit_with_metres_as_mm(unit)[1]))
     failed = ((entry["recording"], entry["message"]) for entry in result["held_out"] if "message" in entry)
     do = f" If its motion grew, {FAILED_ROLLOUT_ADVICE}." * (result["status"] != "failed")
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors (rms) on held-out recordings, which the fit does not use")
     known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
-    is_large = any(error > MAX_NOISE_RATIO * noise for error, noise in known if error and noise)
-    said = "An error above twice that of noise alone shows an error of the model."
-    small = "model predicts them well" if result["fit"]["explains"] else "error of the model is small, but above noise"
-    said = said if is_large else f"No error exceeds twice that of noise alone, so the {small}."
+    said = "No error exceeds twice that of noise alone, so the model predicts them well."
+    if not result["fit"]["explains"] or any(error > MAX_NOISE_RATIO * x for error, x in known if error and x):
+        said = "An error above twice that of noise alone shows an error of the model."
     said += " Noise alone includes expected errors of torques, sensors and clocks."
-    yield said if any(row[3] for row in rows[1:]) else ""
+    yield said if known else ""
 
 
 def _shown_channels(errors: Mapping[str, float]) -> list[str]:
@@ -224,7 +232,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         yield f"{text} Use their 95 % intervals{rough}."
 
 
-def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _bound_sentences(free: Mapping[str, Mapping[str, Any]], explains: bool) -> Iterator[str]:
     """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
     by_bound = dict[tuple[str, str], list[str]]()
     for name, entry in free.items():
@@ -232,15 +240,17 @@ def _bound_sentences(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
-                if entry[side] == 0:
-                    remedy = "Fix {0} there (parameters.{0}.free: false) if it is absent. If not, find another cause."
-                elif entry["verdict"] == "not_identifiable":
+                if entry[side] == 0 and not explains:
+                    remedy = "The model's error can be the cause."
+                elif entry[side] == 0:
+                    remedy = "Fix {0} there (parameters.{0}.free: false) if it is absent, else run `yid-ocp diagnose`."
+                elif entry["verdict"] == "not_identifiable" and explains:
                     remedy = "Fix {0} at a known value, because these recordings do not determine it."
                 by_bound.setdefault((bound, remedy), []).append(name)
     for (bound, remedy), names in by_bound.items():
         what, own = f"{abbreviated_names_text(names)} ended at the {bound}", names[0] if len(names) == 1 else "NAME"
-        said = f"{what}, so values beyond it were not tried and the other values may be wrong."
-        yield f"{said} {remedy.format(own)}"
+        said = ", so values beyond it were not tried and the other values may be wrong" if explains else ""
+        yield f"{what}{said}. {remedy.format(own)}"
 
 
 @SUMMARIES.register("yid-identifiability/1")
@@ -452,10 +462,16 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     elif is_advised:
         ended = f"`solve` can run, but values may be wrong. First read the {'issues' if mild else 'warnings'} below."
     elif coarse:
-        ended = "`solve` can run. It tests whether the coarse simulation (warnings below) changes the estimates."
+        ended = "`solve` can run. The simulation may be too coarse (warnings below)."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))
     yield SummaryStatement(ended, "conclusion")
     yield from issue_summary_blocks(result, with_verdict=False)
+    alike = dict[str, list[str]]()  # names of the recordings by warning
+    for text in (*coarse, *warnings):
+        name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
+        alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
+    texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
+    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
     yield f"Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
@@ -466,17 +482,14 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for name, group in entry["groups"].items():
             taken = (str(group["samples"]), f"{group['rate']:.4g} Hz", f"{group['longest_gap']:.3g} s")
             rows.append((entry["recording"], use, name, *taken))
-        for cells in _noise_cells(entry["noise"]):
+        for cells in _noise_cells(entry["noise"], entry.get("noise_fraction", 1.0)):
             noise.setdefault(cells, []).append(entry["recording"])
         gaps = [f"'{name}' by {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items() if gap > _CLOSED_GAP]
         apart.setdefault(", ".join(gaps), []).append(f"'{entry['recording']}'")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
-    rows = [("channel", "noise (std)", "constant error (std)", "source", "recordings")]
+    rows = [("channel", "noise (std; of points: per axis)", "constant error (std)", "source", "recordings")]
     rows += [(*cells, ", ".join(own) * (len(own) < len(result["recordings"]))) for cells, own in noise.items()]
     yield SummaryTable(rows, "Noise of the readings")
-    share = min((entry.get("noise_fraction", 1.0) for entry in result["recordings"]), default=1.0)
-    said = f"A fit takes {1 / share:.3g} times this noise as the std of readings, to allow for errors of the model."
-    yield f"{said} This is set by diagnosis.noise_fraction_of_stated_std and no fault." if share < 1 else ""
     told = ((text, abbreviated_names_text(names)) for text, names in apart.items() if text)
     yield from (f"At the start of {names}, hand and object are apart at grasp {text}." for text, names in told)
     convergence = result["convergence"]
@@ -486,26 +499,24 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         for row in convergence[key]:
             hertz = [f"{f:.4g}" for f in row["hertz"]]
             rows.append((f"{row['value']:g}", *hertz, *[""] * (count - len(hertz)), row["message"]))
-        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}")
+        yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}", is_page_only=True)
     yield convergence["message"]
-    yield from (SummaryStatement(f"warning: {text.removesuffix('.')}.", "verdict") for text in coarse)
-    alike = dict[str, list[str]]()  # names of the recordings by warning
-    for text in warnings:
-        name, _, what = text.rpartition("', ") if text.startswith("in '") else ("", "", text)
-        alike.setdefault(what, []).extend([name.removeprefix("in '")] * bool(name))
-    texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
-    yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     step += ", after the advice above is followed" * is_advised
     yield next_steps_table(result, {step: "solve"} if result["recordings"] and not severe else {})
 
 
-def _noise_cells(noise: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Yield channel, std of its noise, std of a constant error and source of the noise, as table cells."""
+def _noise_cells(noise: Mapping[str, Any], share: float) -> Iterator[Sequence[str]]:
+    """Yield channel, std of its noise (`share` of the stated one), std of a constant error and source, as cells."""
     for channel, known in noise.items():
         std, offset = (" ".join(value_text_and_display_unit(known.get(k), known["unit"])) for k in ("std", "bias_std"))
         source = "estimated" if known.get("estimated") else "stated"
+        stated = known["std"]
+        if share < 1 and stated is not None and "estimated" not in known:  # readings, not inputs
+            stated /= share
+            size = " ".join(value_text_and_display_unit(stated, known["unit"]))
+            source = f"{share:g} times the stated {size} (diagnosis.noise_fraction_of_stated_std)"
         recorded = known.get("recorded_std")
-        if recorded is not None and not math.isclose(recorded, known["std"] or 0.0, rel_tol=0.01):
+        if recorded is not None and not math.isclose(recorded, stated or 0.0, rel_tol=0.01):
             size = " ".join(value_text_and_display_unit(recorded, known["unit"]))
             source += f" {size}, low-pass filtered, with the noise of the angles"
         if known["std"] is not None:

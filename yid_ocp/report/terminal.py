@@ -14,7 +14,7 @@ import numpy as np
 
 from yid_ocp.data import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, mean_sample_rate
-from yid_ocp.display import abbreviated_names_text, grouped
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.inference import uncertainty
 from yid_ocp.registry import Registry
 from yid_ocp.sensors.base import channel_specs_for_group_name
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 TableRows = list[Sequence[str]]
 _MIN_TABLE_ISSUES = 4  # number of issues from which on a table gives an overview
 _MAX_CHANGE_FROM_START = 0.05  # relative change of a parameter up to which a fit has left it near its start
-_MAX_SHIFTS = 5  # estimates that one finer discretisation changes, the largest change over its std first
 MAX_NOISE_RATIO = 2.0  # largest ratio of an error to noise, or to the fit's error, that needs no sentence
 MAX_CHANNELS_SHOWN_SINGLY = 4  # larger groups of points are shown as a whole; result.json has every point
 _PROSE_WIDTH = 100  # width to which sentences are wrapped
@@ -157,62 +156,60 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
             yield CodeBlock("\n".join(lines))
 
 
-def misfit_summary_blocks(
-    result: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]], is_coarse: bool = False
-) -> SummaryBlockOrTextIterator:
-    """Yield statements on a poor fit: misfit, start values to check, and parameters that are still meaningful.
+def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Yield statements on a poor fit: start values to check, except of joints that hardly move, and rough values.
 
-    A value in `parameters` is meaningful if its standard deviation, misfit included, is at most 10 % of the value, and
-    the model is not `is_coarse`: finer links or time steps explain the recordings no better.
+    A value is rough but meaningful if its standard deviation, misfit included, is at most 10 % of it.
     """
     fit = result["fit"]
-    if not fit["explains"]:
-        said = uncertainty.goodness_of_fit_message(fit["chi2_per_dof"], False)
-        first = "First make the model finer, as follows." if is_coarse else "First follow the advice on the issues."
-        first = first if is_coarse or not fit["data_trusted"] else _start_value_advice(parameters)
-        said = f"{said.partition(' To find')[0]} {first}" if first else said
-        yield SummaryStatement(said, "conclusion")
-        stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
-        values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
-        limit, doubted = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD, fit["data_trusted"] and not is_coarse
-        known = [name for name, std in stds.items() if std is not None and std <= limit * values[name]]
-        said = f"Until then, treat these values as rough: {abbreviated_names_text(known)}. Their ± is at most 10 % and "
-        said += "includes the model error. They are in doubt, as an effect that the model lacks can shift them further."
-        yield SummaryStatement(said if known and doubted else "", "conclusion")
-
-
-def _start_value_advice(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence on undetermined parameters that a poor fit left near their start, empty if there are none."""
-    lost = {key: own for key, own in parameters.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
+    if fit["explains"]:
+        return
+    issues = result.get("issues") or ()
+    still = " ".join(own["setting"] or "" for own in issues if own["cause"] == "weak_excitation")
+    moving = {key: own for key, own in parameters.items() if f"parameters.{key}.free" not in still}
+    lost = {key: own for key, own in moving.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
-    said = f"First check size and unit of the start values of {names}: there the recordings do not depend on them, so "
-    return f"{said}the fit could not correct a wrong one. If they are right, run `yid-ocp diagnose`." if near else ""
+    said = uncertainty.goodness_of_fit_message(fit)
+    is_coarse = any("First set " in note for note in result.get("discretisation_notes", ()))
+    if is_coarse:
+        said = f"{said.partition(' To find')[0]} First make the model finer, as follows."
+    elif not fit["data_trusted"]:
+        said = f"{said.partition(' To find')[0]} First follow the advice on the issues."
+    elif near:
+        said += f" Also check size and unit of the start values of {names}: near them the recordings hardly depend on "
+        said += "them, so the fit could not correct a wrong one."
+    yield SummaryStatement(said, "conclusion")
+    if fit["data_trusted"] and not is_coarse:
+        stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
+        values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
+        limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
+        rough = abbreviated_names_text([n for n, std in stds.items() if std is not None and std <= limit * values[n]])
+        said = f"Until then, take these values as rough: {rough}. Their ± includes the error of the model."
+        yield SummaryStatement(said if rough else "", "conclusion")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each tried finer discretisation of a fit that ended: which estimates it shifts too far."""
+    """Return sentences on finer discretisations of a fit that ended: which shift estimates by more than noise."""
     said, cures = [], list[str]()
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
-    estimates = {name: f"estimate: {own['value']:.4g} " for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "additional noise of the joint angles (sensors.joints.position.std)"
     quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
     found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
         tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
-        moved = {name: own for name, own in tried.items() if abs(own[key]) > own["std"]}
-        worst = sorted(moved.items(), key=lambda item: -abs(item[1][key]) / item[1]["std"])
-        changes = [f"{n} by {e[key]:+.2g}{units.get(n, '')} ({estimates.get(n, '')}± {e['std']:.2g})" for n, e in worst]
+        moved = {name: abs(own[key]) / own["std"] for name, own in tried.items() if abs(own[key]) > own["std"]}
         if moved:
-            text = f"{words.capitalize()} would change these estimates by more than their ± from noise: "
+            worst = max(moved, key=moved.__getitem__)
+            change = f"most of all {worst} (by {tried[worst][key]:+.2g}{units.get(worst, '')}). The ± includes this."
             cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
-            said.append(f"{text}{abbreviated_names_text(changes, _MAX_SHIFTS)}. The ± of the table includes this.")
+            many = count_with_noun(len(moved), "estimate")
+            said.append(f"{words.capitalize()} would change {many} by more than noise, {change}")
         elif tried:
             quiet.append(words)
-    if quiet:
-        tried_words, what = " or ".join(quiet), "" if said else ", so the simulation is accurate enough"
-        said.append(f"{tried_words.capitalize()} would change no estimate by more than its ± from noise{what}.")
+    if quiet and result["fit"]["explains"]:
+        said.append(f"{' or '.join(quiet).capitalize()} would change no estimate by more than its ±.")
     return said + ([f"For a smaller ±, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 

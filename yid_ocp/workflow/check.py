@@ -132,13 +132,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         groups[own.name] = counts | {"rate": 1.0 / period if period else 0.0, "longest_gap": gap}
     entry: dict[str, Any] = {"recording": episode.name, "role": role, "duration": used.duration}
     entry |= {"steps": episode.grid.steps, "groups": groups, "noise": noise, "noise_fraction": share}
-    rate = 1.0 / problem.step.time_step
     if arm is not None:
-        recorded = 1.0 / median_sample_period(arm.t)
-        if recorded < 0.49 * rate:  # more is the same up to rounding
-            said = f"{recorded:.4g} Hz, below half the rate of the model's steps ({rate:.4g} Hz). The motion in "
-            said += f"between is interpolated. If possible, record at {0.5 * rate:.4g} Hz or more"
-            warnings.append(f"in '{episode.name}', joints are sampled at {said}")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
             said = "efforts are taken as the torques at the times of the samples, because the recording does not say "
@@ -225,7 +219,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     found["time_step"] = steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     warnings += _too_stiff_start_warnings(system, theta, h, *(row["hertz"][:1] for row in (steps[0], steps[-1])))
-    step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g} (extrapolated)"
+    step = f"problem.time_step: {_fine_time_step(h, max(steps[-1]['hertz'], default=0.0)):.2g} (for an error of 2 %)"
     _warn(found, "the time step is", f"the time step goes from {h:g} to {h / 4:g} s", step, steps)
     count = None if (item := run.model.object) is None else item.uniform_or_total_link_count
     if item is not None and count is not None:
@@ -267,12 +261,13 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
 def _warn(found: dict[str, Any], what: str, when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row, or say that none does."""
     moved = [
-        f"number {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
+        f"mode {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
         for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False), start=1)
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
     ]
     change = f"by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}"
-    said = f"natural frequencies change {change}: {', '.join(moved)}. Only if your motions excite these vibrations, set"
-    found["warnings"] += [f"{said} {remedy}"] if moved else []
+    said = f"natural frequencies change {change}: {', '.join(moved)}. If this changes the estimates "
+    said += f"(`solve --set output.checked_discretisation=both` tests it), set {remedy}"
+    found["warnings"] += [said] if moved else []
     fine = f"No natural frequency changes {change}, so {what} fine enough. "
     found["message"] += fine * (not moved and bool(rows[-1]["hertz"]))
