@@ -20,6 +20,7 @@ from yid_ocp.report.terminal import (
 )
 
 _MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
+_MAX_FORMULA_LINES = 30  # of a shown formula; result.json has longer ones
 _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
@@ -29,23 +30,33 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    asked = result["asked"] or result["dependence"]
+    asked, entries = result["asked"] or result["dependence"], result["entries"]
+    is_formula_asked = bool(entries) and not result["asked"]
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None and n in asked}
     hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    which = "The chosen parameters" if result["asked"] else "All free parameters"
-    text = f"{which} change the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
+    which = abbreviated_names_text([*changes]) if result["asked"] else "every free parameter"
+    text = f"The readings change visibly with {which}. `yid-ocp identifiability` tests whether they determine it."
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
         text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if changes else "", "conclusion")
+    yield SummaryStatement(text if changes and not is_formula_asked else "", "conclusion")
+    for entry in entries:
+        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g} (SI units)"
+        said = f"The value of {entry['title']} at {linear['at']} is {value}."
+        yield SummaryStatement("" if entry["zero"] else said, "conclusion")
+        if len(entry["lines"]) <= _MAX_FORMULA_LINES:
+            yield CodeBlock("\n".join(entry["lines"]))
+        else:
+            yield f"Its formula has {len(entry['lines'])} lines, which are in result.json (`entries`)."
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
-    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
+    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the matrix A of a step: {radius:.6g})."
     yield SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
-    yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
+    title = "How much a change of a parameter changes the recorded readings"
+    yield SummaryTable(rows, title, is_key_table=True, is_page_only=is_formula_asked)
     title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
     yield SummaryTable(equations, title, is_page_only=not result["asked"])
     rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
@@ -53,14 +64,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         entry = result["parameters"][name]
         cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
         rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
-    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters")
-    for entry in result["entries"]:
-        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
-        yield CodeBlock("\n".join(entry["lines"]))
-        yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
-    files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
-    yield f"The folder has equations.txt (all equations and their names), {files}."
-    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
+    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters", is_page_only=is_formula_asked)
+    files = ", ".join(("linearisation.h5 (A and other derivatives of the state after a step)", *result["exported"]))
+    yield f"The folder has equations.txt (all equations and their names), {files}, and sparsity.png (pattern of zeros)."
+    step = "test whether the recordings determine free parameters"
+    yield next_steps_table(result, {step: "identifiability"} if changes and not is_formula_asked else {})
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
@@ -68,8 +76,16 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
     visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
-    moved: TableRows = [("parameter", "change", "effect on all readings / noise", visible, "most sensitive sensor")]
-    equations: TableRows = [("parameter", "equations", "observed by sensors")]
+    moved: TableRows = [
+        (
+            "parameter",
+            "change (10 % of value or bound)",
+            "effect on all readings / noise",
+            visible,
+            "most sensitive sensor",
+        )
+    ]
+    equations: TableRows = [("parameter", "equations", "of these, observed by sensors")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
