@@ -199,9 +199,9 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
+    said = "Use the column `gauss_newton (best)`: all methods agree within their ± on the parameters that are"
     lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ (0 at most)." in lines) == (
+    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (
         said,
         True,
     )

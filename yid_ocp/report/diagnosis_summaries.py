@@ -323,41 +323,52 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known, judged = result["methods"], result["judged"]
     stopped = [m for m, e in known.items() if e["status"] == "iteration_limit" and not e["iterations"]]  # no values
     methods = {method: entry for method, entry in known.items() if method not in stopped}
-    runs = methods | {"best fit": judged}
+    if not methods and not result["disturbed"]:
+        yield SummaryStatement("No method ended an iteration. Raise compare.total_time_budget.", "conclusion")
+        return
+    best = "best fit" if result["disturbed"] else f"{result['reference']} (best)"
+    others = {m: e for m, e in methods.items() if result["disturbed"] or m != result["reference"]}
+    runs = others | {best: judged}
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
-    for name, own in judged["parameters"].items():
-        if own["free"]:
-            cells = []
-            for method, entry in runs.items():
-                found = entry["parameters"][name]
-                # elsewhere, and without noise, the curvature is no measure of uncertainty
-                ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
-                std, interval = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
-            others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
-    agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
-    objections = [*_objections_to_agreement(result, methods)] or [agree]
+    free = {name: own for name, own in judged["parameters"].items() if own["free"]}
+    for name, own in free.items():
+        cells = []
+        for method, entry in runs.items():
+            found = entry["parameters"][name]
+            # elsewhere, and without noise, the curvature is no measure of uncertainty
+            ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
+            std, interval = (found["std"], found["interval"]) if ended else (None, None)
+            cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
+        told = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+        rows.append((name, *cells, *told, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
+    yield from misfit_summary_blocks(judged, free)
+    agree = f"Use the column `{best}`: all methods agree within their ± on the parameters that are found."
+    objections = [*_objections_to_agreement(result, methods, best)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
+    verdicts = {own["verdict"] for own in free.values()}
+    rows = rows if verdicts - {"not_identifiable"} else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
     costs = [entry["whitened_cost"] for entry in methods.values()]
-    best = f"The method with the lowest cost, {result['reference']}, fits best."
-    if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
-        best = f"All methods of the table fit equally well: their costs hardly differ ({spread:.1g} at most)."
-    yield "" if result["disturbed"] else best
-    for name, entry in methods.items():
+    is_equal = None not in costs and max(costs, default=0.0) - min(costs, default=0.0) < _MAX_EQUAL_COST_SPREAD
+    said = "All methods of the table fit equally well: their costs hardly differ."
+    yield said if is_equal and not result["disturbed"] else ""
+    for name, entry in known.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
-    yield from (f"{n} {sentence}." for n, entry in known.items() for sentence in entry["disagreements"])
-    steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
+        else:
+            yield from (f"{name} {sentence}." for sentence in entry["disagreements"])
+    steps = {"estimate with a report": "solve"} if verdicts & {"identifiable", "weak"} else {}
+    if verdicts & {"weak", "not_identifiable"}:
+        steps["rank experiments that determine more (takes minutes)"] = "identifiability --what-if"
     yield next_steps_table(result, steps)
 
 
-def _objections_to_agreement(result: Mapping[str, Any], methods: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _objections_to_agreement(
+    result: Mapping[str, Any], methods: Mapping[str, Mapping[str, Any]], best: str
+) -> Iterator[str]:
     """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
     own, fit = result["judged"]["parameters"], result["judged"]["fit"]
     found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
@@ -378,7 +389,7 @@ def _objections_to_agreement(result: Mapping[str, Any], methods: Mapping[str, Ma
     elif not found:
         yield "Use no value, because these recordings determine no parameter. `yid-ocp identifiability` shows why."
     elif not result["agree"] and not result["disturbed"]:
-        yield f"Use the column `best fit` (by {result['reference']}). The reasons why other values differ are below."
+        yield f"Use the column `{best}`. The reasons why other values differ are below."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
