@@ -159,26 +159,26 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
 
 @SUMMARIES.register("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    score, *others, cases = _blind_tables(result)
+    *rates, cases = _blind_tables(result)
     yield from (SummaryStatement(text, "verdict") for text in _blind_sentences(result))
-    yield replace(score, is_key_table=True)
-    yield from others
-    yield replace(cases, is_page_only=True)
+    is_conclusive = len(result["marks"]) >= _MIN_CONCLUSIVE_CASES
+    yield from (replace(t, is_key_table=t is rates[0], is_page_only=not is_conclusive) for t in rates)
+    yield replace(cases, is_page_only=is_conclusive)
 
 
 def _blind_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on cases, right answers, false alarms, overlooked effects and probabilities of a blind test."""
     count = len(result["marks"])
-    yield f"The blind test has {count} synthetic cases (seed {result['seed']})."
-    text = "Draw no conclusion from so few cases: the 95 % intervals below are wide. Repeat the command with --cases "
-    text += f"{_MIN_CONCLUSIVE_CASES} and another --out."
+    yield f"The blind test has {count_with_noun(count, 'synthetic case')} (seed {result['seed']})."
+    text = f"Draw no conclusion from so few: repeat the command with --cases {_MIN_CONCLUSIVE_CASES} and another --out."
     yield text if 0 < count < _MIN_CONCLUSIVE_CASES else ""
     right, of = (sum(own["right"][key] for own in result["experiments"].values()) for key in ("count", "of"))
     alarms, seen = (result["intervals"][key] for key in ("false_alarms", "detected"))
-    yield f"{right} of {of} cases with a hidden cause were answered right." if of else ""
-    yield f"{alarms['count']} of {alarms['of']} cases without an effect had a false alarm." if alarms["of"] else ""
-    missed = f"{seen['of'] - seen['count']} of {seen['of']} cases with one effect were overlooked: no gap was reported."
-    yield missed if seen["of"] else ""
+    yield f"Right answers: {right} of {count_with_noun(of, 'case')} with a hidden cause." if of else ""
+    said = f"False alarms: {alarms['count']} of {count_with_noun(alarms['of'], 'case')} without an effect."
+    yield said if alarms["of"] else ""
+    missed = f"{seen['of'] - seen['count']} of {count_with_noun(seen['of'], 'case')} with one effect"
+    yield f"Overlooked (no gap was reported): {missed}." if seen["of"] else ""
     stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
     if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
@@ -274,13 +274,25 @@ def _rate(own: Mapping[str, Any]) -> str:
 @SUMMARIES.register("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
-    told = (own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
-    found = grouped(((name, own["unit"]), own) for name, own in told)  # runs of other models may have other units
+    fitted = {entry["name"]: entry for entry in runs if entry["ok"]}
+    told = (own for entry in fitted.values() for own in entry["parameters"].items() if own[1]["value"] is not None)
+    found = grouped(
+        ((name, own["unit"]), own["value"])  # runs of other models may have other units
+        for name, own in told
+        if own["verdict"] in _FOUND_VERDICTS
+    )
     names = sorted(found, key=lambda name: -len(found[name]))
     heads = [(key, f"{key[0]} [{key[1]}]" if key[1] else key[0]) for key in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
     ends = [entry["status"].replace("error", "stopped by an error").replace("_", " ") for entry in runs]
-    said = [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
+    poor = {n: f"{e['chi2_per_dof']:.3g}" for n, e in fitted.items() if e.get("explains") is False}
+    text = f"Use no value of {abbreviated_names_text([*poor])}: the model does not explain the recordings (chi2 per "
+    text += f"degree of freedom {', '.join(poor.values())}; noise alone: 1). Run `yid-ocp diagnose`."
+    verdicts = {n: {own["verdict"] for own in e["parameters"].values()} for n, e in fitted.items()}
+    lost = abbreviated_names_text([n for n, own in verdicts.items() if own == {"not_identifiable"}])
+    said = [text] * bool(poor)
+    said += [f"The recordings of {lost} determine no parameter. `yid-ocp identifiability` shows why."] * bool(lost)
+    said += [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
     failed = ((end, run) for end, run in zip(ends, runs, strict=True) if not run["ok"])
     said += [f"{run['name']}: {end}: {run['message'].splitlines()[0].removesuffix('.')}." for end, run in failed]
     alike = result["history"]
@@ -289,8 +301,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
-    for (name, unit), entries in found.items():
-        values = [own["value"] for own in entries if own["verdict"] in _FOUND_VERDICTS]
+    for (name, unit), values in found.items():
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), unit))
@@ -307,7 +318,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
         cells = []
         for name, unit in heads:
             own = entry["parameters"].get(name, {"value": None})
-            if own["value"] is None or own["unit"] != unit:
+            if own["value"] is None or own["unit"] != unit or not entry["ok"]:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
                 cells.append(value_and_uncertainty_text(own["value"], own["std"], None))
@@ -315,7 +326,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
                 cells.append(VERDICT_TABLE_TEXTS[own["verdict"]])
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
         time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
-        yield entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time
+        yield entry["name"], entry["status"].replace("_", " "), fit, ", ".join(entry["effects"]), *cells, time
 
 
 @SUMMARIES.register("yid-compare/1")
@@ -472,7 +483,7 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         own = entry["values"]
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
-        together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
+        together = "" if entry["drifted"] else value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, shown_unit(entry["unit"]), p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True)
@@ -486,7 +497,8 @@ def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
         rows.append((entry["name"], *apart, *verdict))
-    yield SummaryTable(rows, "Difference of each run from the others")
+    # of two runs, both rows would have the same numbers
+    yield SummaryTable(rows if len(history["runs"]) > 2 else [], "Difference of each run from the others")
     yield "p-value: probability that noise alone causes such a difference."
 
 
@@ -501,9 +513,10 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     for name in drifted:
         entry = result["parameters"][name]
         (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
-        said = f"{name} differs between the runs, from {low:.4g} in {first} to {high:.4g} {entry['unit']} in {last}"
-        limit = f"it counts if p is below {result['level'] / len(result['parameters']):.2g}"
-        yield f"{said} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
+        places = (f" in {first}", f" in {last}") if len(runs) > 2 else ("", "")
+        said = f"{name} differs between the runs, from {low:.4g}{places[0]} to {high:.4g} {entry['unit']}{places[1]}"
+        limit = f"limit: {result['level'] / len(result['parameters']):.2g}"
+        yield f"{said} (noise alone: p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         names = " and ".join(wrong)
         rest = abbreviated_names_text([entry["name"] for entry in runs if not entry["distrusted"]])
