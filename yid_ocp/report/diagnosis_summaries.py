@@ -1,11 +1,11 @@
-"""Summaries of a diagnosis, a blind test, a batch and an export, and of comparisons of methods or runs."""
+"""Summaries of a diagnosis, a blind test, and a batch, and of comparisons of methods or runs."""
 
 from __future__ import annotations
 
 import shlex
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,6 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
-_MAX_REPRODUCED_ERROR = 3  # largest error of a replay that reproduces a recording [noise std]
 _MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits; 0.5 is one standard deviation
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
@@ -275,12 +274,9 @@ def _rate(own: Mapping[str, Any]) -> str:
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
     fitted = {entry["name"]: entry for entry in runs if entry["ok"]}
-    told = (own for entry in fitted.values() for own in entry["parameters"].items() if own[1]["value"] is not None)
-    found = grouped(
-        ((name, own["unit"]), own["value"])  # runs of other models may have other units
-        for name, own in told
-        if own["verdict"] in _FOUND_VERDICTS
-    )
+    told = ((n, e) for run in fitted.values() for n, e in run["parameters"].items() if e["value"] is not None)
+    # runs of other models may have other units
+    found = grouped(((n, e["unit"]), e["value"]) for n, e in told if e["verdict"] in _FOUND_VERDICTS)
     names = sorted(found, key=lambda name: -len(found[name]))
     heads = [(key, f"{key[0]} [{key[1]}]" if key[1] else key[0]) for key in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
@@ -377,27 +373,18 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield next_steps_table(result, steps)
 
 
-def _objections_to_agreement(
-    result: Mapping[str, Any], methods: Mapping[str, Mapping[str, Any]], best: str
-) -> Iterator[str]:
+def _objections_to_agreement(result: Mapping[str, Any], methods: Iterable[str], best: str) -> Iterator[str]:
     """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
-    own, fit = result["judged"]["parameters"], result["judged"]["fit"]
-    found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
+    fit, judged = result["judged"]["fit"], result["judged"]["parameters"].values()
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
         yield "Use the column `best fit`, which includes this noise and has the verdicts."
-        for name, e in found.items():
-            values = {m: one["parameters"][name]["value"] for m, one in methods.items()}
-            off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
-            if off:
-                said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
-                yield f"{name} is {said} {e['unit']} by the best fit, but {', '.join(off)} (more than 2 std away)."
     if not fit["explains"]:
         yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
-    elif not found:
+    elif not any(entry["verdict"] == "identifiable" for entry in judged):
         yield "Use no value, because these recordings determine no parameter. `yid-ocp identifiability` shows why."
     elif not result["agree"] and not result["disturbed"]:
         yield f"Use the column `{best}`. The reasons why other values differ are below."
@@ -568,54 +555,3 @@ def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
     if entry is not None and entry["free"]:
         return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])
     return "" if entry is None else f"{entry['value']:.4g} (fixed)"
-
-
-@SUMMARIES.register("yid-export/1")
-def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
-    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    listed = {
-        name: entry
-        for name, entry in manifest["parameters"].items()
-        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
-    }
-    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
-    entries = (manifest["effects"] | grasps | listed).items()
-    rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
-    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
-    lost = [name for name, entry in entries if entry["status"] == "not representable"]
-    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run."
-    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
-    gate = manifest["gate"] or {}
-    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, manifest["unknown"]))
-    if unknown := manifest["unknown"]:
-        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has them with the values"
-        yield SummaryStatement(f"{text} where the search ended. Do not rely on them.", "verdict")
-    values = dict.fromkeys(unknown, "unreliable")
-    rows += [(name, kinds[entry["status"]], values.get(name, ""), entry["how"]) for name, entry in entries]
-    yield SummaryTable(rows, "Parts of the model in the file")
-    rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
-    for name, entry in gate.get("channels", {}).items():
-        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
-        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
-
-
-def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
-    if "reason" in gate:
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
-    if "channels" not in gate:
-        return
-    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-    noise = {name: own["noise"] for name, own in gate["channels"].items() if own["noise"]}
-    if not noise:
-        yield "A replay in MuJoCo does not tell whether the file is right, because no channel has a stated noise."
-        return
-    ratios, initial = ({n: gate["channels"][n][key] / noise[n] for n in noise} for key in ("after", "before"))
-    worst = max(ratios, key=lambda name: ratios[name])
-    is_bad = ratios[worst] > _MAX_REPRODUCED_ERROR
-    text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
-    text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
-    yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
-    yield "The unreliable values below may be the cause." if is_bad and unreliable else ""

@@ -1,12 +1,12 @@
-"""Summary of the result of `inspect`, for the terminal and the HTML report."""
+"""Summaries of the results of `inspect` and `export`, for the terminal and the HTML report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from yid_ocp.display import abbreviated_names_text, count_with_noun
-from yid_ocp.inference.uncertainty import percent_number_text
+from yid_ocp.display import abbreviated_names_text, count_with_noun, kind_of_part, names_by_kind_text
+from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, percent_number_text
 from yid_ocp.report.terminal import (
     SUMMARIES,
     CodeBlock,
@@ -16,11 +16,14 @@ from yid_ocp.report.terminal import (
     TableRows,
     bound_range_text,
     next_steps_table,
+    scale_and_unit_with_metres_as_mm,
     shown_unit,
+    value_text_and_display_unit,
 )
 
 _MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
 _MAX_FORMULA_LINES = 30  # of a shown formula; result.json has longer ones
+_MAX_REPRODUCED_ERROR = 3  # largest error of a replay that reproduces a recording [noise std]
 _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
@@ -42,12 +45,10 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryStatement(text if changes and not is_formula_asked else "", "conclusion")
     for entry in entries:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g} (SI units)"
-        said = f"The value of {entry['title']} at {linear['at']} is {value}."
-        yield SummaryStatement("" if entry["zero"] else said, "conclusion")
-        if len(entry["lines"]) <= _MAX_FORMULA_LINES:
-            yield CodeBlock("\n".join(entry["lines"]))
-        else:
-            yield f"Its formula has {len(entry['lines'])} lines, which are in result.json (`entries`)."
+        yield SummaryStatement(f"The value of {entry['title']} at {linear['at']} is {value}.", "conclusion")
+        is_long = (count := len(entry["lines"])) > _MAX_FORMULA_LINES
+        yield CodeBlock("" if is_long else "\n".join(entry["lines"]))
+        yield f"Its formula has {count} lines, which are in result.json (`entries`)." if is_long else ""
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
     radius = linear["spectral_radius"]
@@ -76,15 +77,8 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
     visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
-    moved: TableRows = [
-        (
-            "parameter",
-            "change (10 % of value or bound)",
-            "effect on all readings / noise",
-            visible,
-            "most sensitive sensor",
-        )
-    ]
+    heads = ("effect on all readings / noise", visible, "most sensitive sensor")
+    moved: TableRows = [("parameter", "change (10 % of value or bound)", *heads)]
     equations: TableRows = [("parameter", "equations", "of these, observed by sensors")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
@@ -113,3 +107,63 @@ def _row_names_text(names: Sequence[str]) -> str:
     """Return names of equations in one line, or only their number if that line would be too long."""
     text = abbreviated_names_text(names)
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
+
+
+@SUMMARIES.register("yid-export/1")
+def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
+    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
+    listed = {
+        name: entry
+        for name, entry in manifest["parameters"].items()
+        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
+    }
+    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
+    entries = (manifest["effects"] | grasps | listed).items()
+    # a part that is kept in part is lost with another one
+    lost = [n for n, entry in entries if entry["status"] == "not representable" and ". Kept: " not in entry["how"]]
+    said = f"The file lacks {names_by_kind_text(lost)}, so its predictions differ from those of the run."
+    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
+    absent = [n for n, own in manifest["parameters"].items() if own["status"] == "not representable"]
+    unknown = [name for name in manifest["unknown"] if name not in absent]
+    gate = manifest["gate"] or {}
+    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
+    text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the "
+    yield SummaryStatement(f"{text}search ended. Do not rely on them." if unknown else "", "verdict")
+    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
+    states = dict.fromkeys(unknown, "unreliable")
+    for name, own in manifest["parameters"].items():
+        is_rough = own["std"] is not None and own["std"] > MAX_IDENTIFIABLE_RELATIVE_STD * abs(own["value"])
+        states |= {name: "weakly determined"} if is_rough and name not in absent else {}
+    alike = dict[Sequence[str], list[str]]()  # names by kind and cells
+    for name, own in entries:
+        status = "partly" if ". Kept: " in own["how"] else kinds[own["status"]]
+        alike.setdefault((kind_of_part(name), status, states.get(name, ""), own["how"]), []).append(name)
+    rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
+    rows += [(names_by_kind_text(names), *cells) for (_, *cells), names in alike.items()]
+    yield SummaryTable(rows, "Parts of the model in the file")
+    rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
+    for name, entry in gate.get("channels", {}).items():
+        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
+        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
+    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
+
+
+def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
+    """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
+    if "reason" in gate:
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
+    if "channels" not in gate:
+        return
+    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
+    noise = {name: own["noise"] for name, own in gate["channels"].items() if own["noise"]}
+    if not noise:
+        yield "A replay in MuJoCo does not tell whether the file is right, because no channel has a stated noise."
+        return
+    ratios, initial = ({n: gate["channels"][n][key] / noise[n] for n in noise} for key in ("after", "before"))
+    worst = max(ratios, key=lambda name: ratios[name])
+    is_bad = ratios[worst] > _MAX_REPRODUCED_ERROR
+    text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
+    text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
+    yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
+    yield "The unreliable values below may be the cause." if is_bad and unreliable else ""

@@ -411,9 +411,9 @@ def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield "Do not use this motion, because the model cannot simulate it to its end."
         return
     place, limit = ", ".join(f"{x:.4g}" for x in result["place"]), f"{1e3 * result['tolerance']:g}"
-    near = (limit, "position_tolerance", "mm")
+    near = (limit, "plan.position_tolerance", "mm")
     yield f"The point '{result['point']}' has the target ({place}) m in the world after {result['duration']:g} s."
-    fastest = (f"{1e3 * result['speed_tolerance']:g}", "point_rest_speed_tolerance", "mm/s")
+    fastest = (f"{1e3 * result['speed_tolerance']:g}", "plan.point_rest_speed_tolerance", "mm/s")
     rows: TableRows = [("quantity", "predicted", "limit", "setting of the limit", "unit")]
     rows.append(("largest distance of the point from the target", f"{1e3 * result['error']:.3g}", *near))
     rows.append(("largest speed of any point of the object", f"{1e3 * result['swing']:.3g}", *fastest))
@@ -551,14 +551,14 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
     heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
-    rows: TableRows = [("point", "images", "± std [mm]", *heads)]
+    rows: TableRows = [("point", "images", "± [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
     used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
-    used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    used += "recording.h5 has their points."
     used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
     yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Tracked points", is_key_table=True)
@@ -568,3 +568,5 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
+    steps = {"estimate from these points (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"}
+    yield next_steps_table(result, {} if result["refused"] else steps)
