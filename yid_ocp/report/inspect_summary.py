@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from yid_ocp.display import abbreviated_names_text, count_with_noun, kind_of_part, names_by_kind_text
-from yid_ocp.inference.uncertainty import MAX_IDENTIFIABLE_RELATIVE_STD, percent_number_text
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, kind_of_part, names_by_kind_text
+from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.report.terminal import (
     SUMMARIES,
     CodeBlock,
@@ -131,15 +131,9 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the "
     yield SummaryStatement(f"{text}search ended. Do not rely on them." if unknown else "", "verdict")
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
-    states = dict.fromkeys(unknown, "unreliable")
-    for name, own in manifest["parameters"].items():
-        is_rough = own["std"] is not None and own["std"] > MAX_IDENTIFIABLE_RELATIVE_STD * abs(own["value"])
-        states |= {name: "weakly determined"} if is_rough and name not in absent else {}
-    alike = dict[Sequence[str], list[str]]()  # names by kind and cells
-    for name, own in entries:
-        status = "partly" if ". Kept: " in own["how"] else kinds[own["status"]]
-        alike.setdefault((kind_of_part(name), status, states.get(name, ""), own["how"]), []).append(name)
-    rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
+    told = ((n, "partly" if ". Kept: " in own["how"] else kinds[own["status"]], own["how"]) for n, own in entries)
+    alike = grouped(((kind_of_part(name), status, how), name) for name, status, how in told)
+    rows: TableRows = [("part of the model", "in the file", "how, or why not")]
     rows += [(names_by_kind_text(names), *cells) for (_, *cells), names in alike.items()]
     yield SummaryTable(rows, "Parts of the model in the file")
     rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
@@ -166,4 +160,4 @@ def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Ite
     text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
     text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
     yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
-    yield "The unreliable values below may be the cause." if is_bad and unreliable else ""
+    yield "Unreliable values may be the cause." if is_bad and unreliable else ""

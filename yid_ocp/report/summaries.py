@@ -568,5 +568,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
-    steps = {"estimate from these points (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"}
+    steps = {
+        "estimate from these points (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"
+    }
     yield next_steps_table(result, {} if result["refused"] else steps)
