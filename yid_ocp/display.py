@@ -95,6 +95,17 @@ def abbreviated_names_text(names: Sequence[str], max_entries: float = _MAX_NAMES
     return ", ".join(said) + (f" and {left} more" if left else "")
 
 
+def kind_of_part(name: str) -> str:
+    """Return the kind in the name of an effect (`kind@place`) or parameter (`place.kind`)."""
+    return name.partition("@")[0] if "@" in name else name.rpartition(".")[2]
+
+
+def names_by_kind_text(names: Sequence[str]) -> str:
+    """Join names of effects and parameters to one line of text. Four or more of a kind become a number."""
+    kinds = grouped((kind_of_part(name), name) for name in names)
+    return ", ".join(f"{kind} ({len(own)} times)" if len(own) > 3 else ", ".join(own) for kind, own in kinds.items())
+
+
 def grouped(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     """Return the values of (key, value) pairs by key, in their order."""
     found: dict[_Key, list[_Value]] = {}

@@ -84,7 +84,7 @@ def test_a_solve_says_what_is_not_found():
     size, text = "chi2 per degree of freedom is 1.03; noise alone gives 1", " ".join(lines)
     assert "These recordings do not determine p_not_identifiable. `yid-ocp identifiability` shows why" in text
     assert "1 of 4 free parameters are found: their ± (one standard deviation) is at most 10 % of the value" in text
-    assert "These parameters are only weakly determined: p_weak. Use their 95 % intervals, which are rough." in text
+    assert "Only weakly determined (± above 10 % and up to 400 %): p_weak. Use their 95 % intervals, which" in text
     assert f"The model explains the recordings to within their noise ({size})." in text
     assert all(fact in lines[-1] for fact in ("converged", "4 iterations", "1.0 s"))
     assert any(line.startswith("Recorded torques") for line in told("yid-solve/1", solved(unused_efforts=True)))
@@ -216,9 +216,9 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
+    said = "Use the column `gauss_newton (best)`: all methods agree within their ± on the parameters that are"
     lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ (0 at most)." in lines) == (
+    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (
         said,
         True,
     )
@@ -231,7 +231,6 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("Do not use the columns single_shooting, because these methods ignore noise")
-    assert "a is 9 ± 0.1 N m/rad by the best fit, but 7 by single_shooting (more than 2 std away)." in lines
     assert line_of(lines, "parameter").split()[2:5] == ["best", "fit", "unit"], "a method without a value has no column"
     assert not any("does not explain" in line or "all methods agree" in line for line in lines)
 
@@ -245,7 +244,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     assert "0 of 1 parameters can be determined" in lines[0]
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
     lines = told("yid-identifiability/1", result)
-    assert any("Fewest changes with which all parameters would be found: a weld." in line for line in lines)
+    assert any("All parameters would be found with: a weld." in line for line in lines)
     at = lines.index("estimate from FILE, a recording with a weld:")
     assert lines[at + 1].endswith("'recordings.estimate=[FILE]'")
     assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"

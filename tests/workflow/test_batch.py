@@ -240,7 +240,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png') == 3
     assert f"The blind test has {len(marks)} synthetic cases (seed 1" in page
-    assert ("0 of 5 cases without an effect had a false alarm." in page) == bool(marks)
+    assert ("False alarms: 0 of 5 cases without an effect." in page) == bool(marks)
     assert page.count("case_000") >= len(marks)
     with pytest.raises(OutputError, match="folder to write to does not exist"):
         draw_blind_validation_figures(tmp_path / "nowhere", result)

@@ -358,14 +358,15 @@ class _Component(NamedTuple):
     unit: str
 
 
-_SERIES = "1/{a} + 1/{b}, like springs in series"
-# combinations of a and b: text, relative change that preserves it, b for a new a, whether units must be equal
-_Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
+# combinations of a and b: text, value v, its relative change by those of a and b, b for v and a new a, and whether
+# units must be equal
+_Combination = tuple[str, Callable[..., float], Callable[..., tuple[float, float]], Callable[..., float], bool]
+_SERIES, _SUM = "1/{a} + 1/{b}, like springs in series", "{a} + {b}, like parallel springs"
 _COMBINATIONS: tuple[_Combination, ...] = (
-    (_SERIES, lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
-    ("{a} + {b}, like parallel springs", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
-    ("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
-    ("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),
+    (_SERIES, lambda a, b: a * b / (a + b), lambda a, b, v: (v / a, v / b), lambda v, n: v * n / (n - v), True),
+    (_SUM, lambda a, b: a + b, lambda a, b, v: (a / v, b / v), lambda v, n: v - n, True),
+    ("the ratio {a} / {b}", lambda a, b: a / b, lambda a, b, v: (1.0, -1.0), lambda v, n: n / v, False),
+    ("the product {a} x {b}", lambda a, b: a * b, lambda a, b, v: (1.0, 1.0), lambda v, n: v / n, False),
 )
 
 
@@ -379,11 +380,8 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
         change = ("a change of " if len(parts) == 1 else "") + _change_words(parts)
         return f"these recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
-    form = _combination(view, *parts) if len(parts) == 2 else None
-    if form is None:
-        return _combination_words(parts)
-    names = [part.name for part in parts]
-    return f"{_joined(names)} are determined only as {form.format(a=names[0], b=names[1])}"
+    said = _combination(view, *parts) if len(parts) == 2 and all(part.value > 0 for part in parts) else None
+    return _combination_words(parts) if said is None else f"{_joined([p.name for p in parts])} are determined {said}"
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
@@ -449,19 +447,26 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _combination(view: _Sensitivities, first: _Component, second: _Component) -> str | None:
-    """Return the simple combination of two parameters that the data determine, also at a finite change, or None."""
+    """Return the simple combination of two parameters > 0 that the data determine, with its value and ±, or None."""
     direction = np.array([first.coefficient, second.coefficient])
     direction /= np.linalg.norm(direction)
     (a, b), tried = (first.value, second.value), list[tuple[float, str]]()
     new_a = a * _FINITE_CHANGE_FACTOR
-    for words, slope_at, partner, same_unit in _COMBINATIONS:
-        slope = np.array(slope_at(a, b))
-        mismatch = 1.0 - abs(float(slope @ direction)) / float(np.linalg.norm(slope))
+    least_seen = 1.0 / (uncertainty.MAX_WEAK_RELATIVE_STD * float(np.linalg.norm(view.relative, 2)))
+    stds = np.linalg.pinv(view.relative, least_seen)[[view.names.index(part.name) for part in (first, second)]]
+    for words, value_of, gradient_at, partner, same_unit in _COMBINATIONS:
+        value = value_of(a, b)
+        gradient = np.array(gradient_at(a, b, value))
+        preserving = np.array([gradient[1], -gradient[0]])
+        mismatch = 1.0 - abs(float(preserving @ direction)) / float(np.linalg.norm(gradient))
         if (same_unit and first.unit != second.unit) or mismatch > _MAX_DIRECTION_MISMATCH**2:
             continue
-        new_b = partner(a, b, new_a)
+        new_b = partner(value, new_a)
         if new_b > 0:
-            tried.append((_moved(view, {first.name: new_a, second.name: new_b}), words))
+            std = abs(value) * float(np.linalg.norm(gradient @ stds))
+            size = f"{uncertainty.value_and_uncertainty_text(value, std)} {first.unit if same_unit else 'in SI units'}"
+            said = f"only as {words.format(a=first.name, b=second.name)} ({'together ' * same_unit}{size})"
+            tried.append((_moved(view, {first.name: new_a, second.name: new_b}), said))
     if not tried:
         return None
     least, best = min(tried, key=lambda entry: entry[0])

@@ -125,9 +125,10 @@ class FeatureExportSupport:
 
 
 def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
-    """Return the worst status of several parts, with the explanations of the parts that have it."""
+    """Return the worst status of several parts, with the explanations of the parts that have it, then the others."""
     status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
-    return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
+    how, kept = (dict.fromkeys(p.how for p in parts if (p.status == status) == own) for own in (True, False))
+    return FeatureExportSupport(status, "; ".join(how) + f". Kept: {', '.join(kept)}" * bool(kept))
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:

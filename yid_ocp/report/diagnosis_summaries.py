@@ -1,11 +1,11 @@
-"""Summaries of a diagnosis, a blind test, a batch and an export, and of comparisons of methods or runs."""
+"""Summaries of a diagnosis, a blind test, and a batch, and of comparisons of methods or runs."""
 
 from __future__ import annotations
 
 import shlex
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,6 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
-_MAX_REPRODUCED_ERROR = 3  # largest error of a replay that reproduces a recording [noise std]
 _MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits; 0.5 is one standard deviation
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
@@ -151,26 +150,26 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
 
 @SUMMARIES.register("yid-blind/1")
 def _blind_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    score, *others, cases = _blind_tables(result)
+    *rates, cases = _blind_tables(result)
     yield from (SummaryStatement(text, "verdict") for text in _blind_sentences(result))
-    yield replace(score, is_key_table=True)
-    yield from others
-    yield replace(cases, is_page_only=True)
+    is_conclusive = len(result["marks"]) >= _MIN_CONCLUSIVE_CASES
+    yield from (replace(t, is_key_table=t is rates[0], is_page_only=not is_conclusive) for t in rates)
+    yield replace(cases, is_page_only=is_conclusive)
 
 
 def _blind_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on cases, right answers, false alarms, overlooked effects and probabilities of a blind test."""
     count = len(result["marks"])
-    yield f"The blind test has {count} synthetic cases (seed {result['seed']})."
-    text = "Draw no conclusion from so few cases: the 95 % intervals below are wide. Repeat the command with --cases "
-    text += f"{_MIN_CONCLUSIVE_CASES} and another --out."
+    yield f"The blind test has {count_with_noun(count, 'synthetic case')} (seed {result['seed']})."
+    text = f"Draw no conclusion from so few: repeat the command with --cases {_MIN_CONCLUSIVE_CASES} and another --out."
     yield text if 0 < count < _MIN_CONCLUSIVE_CASES else ""
     right, of = (sum(own["right"][key] for own in result["experiments"].values()) for key in ("count", "of"))
     alarms, seen = (result["intervals"][key] for key in ("false_alarms", "detected"))
-    yield f"{right} of {of} cases with a hidden cause were answered right." if of else ""
-    yield f"{alarms['count']} of {alarms['of']} cases without an effect had a false alarm." if alarms["of"] else ""
-    missed = f"{seen['of'] - seen['count']} of {seen['of']} cases with one effect were overlooked: no gap was reported."
-    yield missed if seen["of"] else ""
+    yield f"Right answers: {right} of {count_with_noun(of, 'case')} with a hidden cause." if of else ""
+    said = f"False alarms: {alarms['count']} of {count_with_noun(alarms['of'], 'case')} without an effect."
+    yield said if alarms["of"] else ""
+    missed = f"{seen['of'] - seen['count']} of {count_with_noun(seen['of'], 'case')} with one effect"
+    yield f"Overlooked (no gap was reported): {missed}." if seen["of"] else ""
     stated = [own for own in result["calibration"]["probabilities"] if own["of"]]
     if sum(own["of"] for own in stated) >= _MIN_STATED_PROBABILITIES:
         near = sum(own["low"] <= own["level"] <= own["high"] for own in stated)
@@ -266,13 +265,22 @@ def _rate(own: Mapping[str, Any]) -> str:
 @SUMMARIES.register("yid-batch/1")
 def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = result["runs"]
-    told = (own for entry in runs for own in entry["parameters"].items() if own[1]["value"] is not None)
-    found = grouped(((name, own["unit"]), own) for name, own in told)  # runs of other models may have other units
+    fitted = {entry["name"]: entry for entry in runs if entry["ok"]}
+    told = ((n, e) for run in fitted.values() for n, e in run["parameters"].items() if e["value"] is not None)
+    # runs of other models may have other units
+    found = grouped(((n, e["unit"]), e["value"]) for n, e in told if e["verdict"] in _FOUND_VERDICTS)
     names = sorted(found, key=lambda name: -len(found[name]))
     heads = [(key, f"{key[0]} [{key[1]}]" if key[1] else key[0]) for key in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
     ends = [entry["status"].replace("error", "stopped by an error").replace("_", " ") for entry in runs]
-    said = [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
+    poor = {n: f"{e['chi2_per_dof']:.3g}" for n, e in fitted.items() if e.get("explains") is False}
+    text = f"Use no value of {abbreviated_names_text([*poor])}: the model does not explain the recordings (chi2 per "
+    text += f"degree of freedom {', '.join(poor.values())}; noise alone: 1). Run `yid-ocp diagnose`."
+    verdicts = {n: {own["verdict"] for own in e["parameters"].values()} for n, e in fitted.items()}
+    lost = abbreviated_names_text([n for n, own in verdicts.items() if own == {"not_identifiable"}])
+    said = [text] * bool(poor)
+    said += [f"The recordings of {lost} determine no parameter. `yid-ocp identifiability` shows why."] * bool(lost)
+    said += [f"{count_with_noun(len(runs), 'run')}: {', '.join(f'{n} {end}' for end, n in Counter(ends).items())}."]
     failed = ((end, run) for end, run in zip(ends, runs, strict=True) if not run["ok"])
     said += [f"{run['name']}: {end}: {run['message'].splitlines()[0].removesuffix('.')}." for end, run in failed]
     alike = result["history"]
@@ -281,8 +289,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
-    for (name, unit), entries in found.items():
-        values = [own["value"] for own in entries if own["verdict"] in _FOUND_VERDICTS]
+    for (name, unit), values in found.items():
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), unit))
@@ -299,7 +306,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
         cells = []
         for name, unit in heads:
             own = entry["parameters"].get(name, {"value": None})
-            if own["value"] is None or own["unit"] != unit:
+            if own["value"] is None or own["unit"] != unit or not entry["ok"]:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
                 cells.append(value_and_uncertainty_text(own["value"], own["std"], None))
@@ -307,7 +314,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
                 cells.append(VERDICT_TABLE_TEXTS[own["verdict"]])
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
         time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
-        yield entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time
+        yield entry["name"], entry["status"].replace("_", " "), fit, ", ".join(entry["effects"]), *cells, time
 
 
 @SUMMARIES.register("yid-compare/1")
@@ -315,62 +322,64 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known, judged = result["methods"], result["judged"]
     stopped = [m for m, e in known.items() if e["status"] == "iteration_limit" and not e["iterations"]]  # no values
     methods = {method: entry for method, entry in known.items() if method not in stopped}
-    runs = methods | {"best fit": judged}
+    if not methods and not result["disturbed"]:
+        yield SummaryStatement("No method ended an iteration. Raise compare.total_time_budget.", "conclusion")
+        return
+    best = "best fit" if result["disturbed"] else f"{result['reference']} (best)"
+    others = {m: e for m, e in methods.items() if result["disturbed"] or m != result["reference"]}
+    runs = others | {best: judged}
     beside = [key for key in ("published", "truth") if result[key]]
     rows: TableRows = [("parameter", *runs, *beside, "unit", "verdict")]
-    for name, own in judged["parameters"].items():
-        if own["free"]:
-            cells = []
-            for method, entry in runs.items():
-                found = entry["parameters"][name]
-                # elsewhere, and without noise, the curvature is no measure of uncertainty
-                ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
-                std, interval = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
-            others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
-    yield from misfit_summary_blocks(judged, {n: e for n, e in judged["parameters"].items() if e["free"]})
-    agree = "Use the column `best fit`: all methods agree within their ± on the parameters that are found."
-    objections = [*_objections_to_agreement(result, methods)] or [agree]
+    free = {name: own for name, own in judged["parameters"].items() if own["free"]}
+    for name, own in free.items():
+        cells = []
+        for method, entry in runs.items():
+            found = entry["parameters"][name]
+            # elsewhere, and without noise, the curvature is no measure of uncertainty
+            ended = entry["status"] not in ("stalled", "failed") and not (result["disturbed"] and method in methods)
+            std, interval = (found["std"], found["interval"]) if ended else (None, None)
+            cells.append(value_and_uncertainty_text(found["value"], std, interval, verdict=own["verdict"]))
+        told = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+        rows.append((name, *cells, *told, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
+    yield from misfit_summary_blocks(judged, free)
+    agree = f"Use the column `{best}`: all methods agree within their ± on the parameters that are found."
+    objections = [*_objections_to_agreement(result, methods, best)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
+    verdicts = {own["verdict"] for own in free.values()}
+    rows = rows if verdicts - {"not_identifiable"} else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
     costs = [entry["whitened_cost"] for entry in methods.values()]
-    best = f"The method with the lowest cost, {result['reference']}, fits best."
-    if None not in costs and (spread := max(costs, default=0.0) - min(costs, default=0.0)) < _MAX_EQUAL_COST_SPREAD:
-        best = f"All methods of the table fit equally well: their costs hardly differ ({spread:.1g} at most)."
-    yield "" if result["disturbed"] else best
-    for name, entry in methods.items():
+    is_equal = None not in costs and max(costs, default=0.0) - min(costs, default=0.0) < _MAX_EQUAL_COST_SPREAD
+    said = "All methods of the table fit equally well: their costs hardly differ."
+    yield said if is_equal and not result["disturbed"] else ""
+    for name, entry in known.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
-    yield from (f"{n} {sentence}." for n, entry in known.items() for sentence in entry["disagreements"])
-    steps = {"estimate with a report": "solve", "rank experiments that determine more": "identifiability --what-if"}
+        else:
+            yield from (f"{name} {sentence}." for sentence in entry["disagreements"])
+    steps = {"estimate with a report": "solve"} if verdicts & {"identifiable", "weak"} else {}
+    if verdicts & {"weak", "not_identifiable"}:
+        steps["rank experiments that determine more (takes minutes)"] = "identifiability --what-if"
     yield next_steps_table(result, steps)
 
 
-def _objections_to_agreement(result: Mapping[str, Any], methods: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _objections_to_agreement(result: Mapping[str, Any], methods: Iterable[str], best: str) -> Iterator[str]:
     """Yield sentences on why the methods' estimates cannot be trusted; none if they agree and this is meaningful."""
-    own, fit = result["judged"]["parameters"], result["judged"]["fit"]
-    found = {name: entry for name, entry in own.items() if entry["verdict"] == "identifiable"}
+    fit, judged = result["judged"]["fit"], result["judged"]["parameters"].values()
     if result["disturbed"]:
         words = "these methods ignore noise of the measured torques or angles that move the model"
         yield f"Do not use the columns {', '.join(methods)}, because {words}."
         yield "Use the column `best fit`, which includes this noise and has the verdicts."
-        for name, e in found.items():
-            values = {m: one["parameters"][name]["value"] for m, one in methods.items()}
-            off = [f"{v:.4g} by {m}" for m, v in values.items() if abs(v - e["value"]) > 2 * (e["std"] or 0.0)]
-            if off:
-                said = value_and_uncertainty_text(e["value"], e["std"], e["interval"])
-                yield f"{name} is {said} {e['unit']} by the best fit, but {', '.join(off)} (more than 2 std away)."
     if not fit["explains"]:
         yield "The model does not explain the recordings, so agreement of methods does not confirm the values."
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
-    elif not found:
+    elif not any(entry["verdict"] == "identifiable" for entry in judged):
         yield "Use no value, because these recordings determine no parameter. `yid-ocp identifiability` shows why."
     elif not result["agree"] and not result["disturbed"]:
-        yield f"Use the column `best fit` (by {result['reference']}). The reasons why other values differ are below."
+        yield f"Use the column `{best}`. The reasons why other values differ are below."
 
 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
@@ -456,7 +465,7 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         own = entry["values"]
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
         p = "" if len(own) < 2 else p_value_text(entry["p_value"])
-        together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
+        together = "" if entry["drifted"] else value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, shown_unit(entry["unit"]), p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True)
@@ -470,7 +479,8 @@ def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterato
         apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
         verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
         rows.append((entry["name"], *apart, *verdict))
-    yield SummaryTable(rows, "Difference of each run from the others")
+    # of two runs, both rows would have the same numbers
+    yield SummaryTable(rows if len(history["runs"]) > 2 else [], "Difference of each run from the others")
     yield "p-value: probability that noise alone causes such a difference."
 
 
@@ -485,9 +495,10 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     for name in drifted:
         entry = result["parameters"][name]
         (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
-        said = f"{name} differs between the runs, from {low:.4g} in {first} to {high:.4g} {entry['unit']} in {last}"
-        limit = f"it counts if p is below {result['level'] / len(result['parameters']):.2g}"
-        yield f"{said} (p {p_value_text(entry['p_value'], '= ')}; {limit})."
+        places = (f" in {first}", f" in {last}") if len(runs) > 2 else ("", "")
+        said = f"{name} differs between the runs, from {low:.4g}{places[0]} to {high:.4g} {entry['unit']}{places[1]}"
+        limit = f"limit: {result['level'] / len(result['parameters']):.2g}"
+        yield f"{said} (noise alone: p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         names = " and ".join(wrong)
         rest = abbreviated_names_text([entry["name"] for entry in runs if not entry["distrusted"]])
@@ -539,54 +550,3 @@ def _overlaid_value(entry: Mapping[str, Any] | None) -> str:
     if entry is not None and entry["free"]:
         return value_and_uncertainty_text(entry["value"], entry["std"], verdict=entry["verdict"])
     return "" if entry is None else f"{entry['value']:.4g} (fixed)"
-
-
-@SUMMARIES.register("yid-export/1")
-def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
-    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    listed = {
-        name: entry
-        for name, entry in manifest["parameters"].items()
-        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
-    }
-    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
-    entries = (manifest["effects"] | grasps | listed).items()
-    rows: TableRows = [("part of the model", "in the file", "value", "how, or why not")]
-    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
-    lost = [name for name, entry in entries if entry["status"] == "not representable"]
-    said = f"The file lacks {abbreviated_names_text(lost)}, so its predictions differ from those of the run."
-    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
-    gate = manifest["gate"] or {}
-    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, manifest["unknown"]))
-    if unknown := manifest["unknown"]:
-        text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has them with the values"
-        yield SummaryStatement(f"{text} where the search ended. Do not rely on them.", "verdict")
-    values = dict.fromkeys(unknown, "unreliable")
-    rows += [(name, kinds[entry["status"]], values.get(name, ""), entry["how"]) for name, entry in entries]
-    yield SummaryTable(rows, "Parts of the model in the file")
-    rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
-    for name, entry in gate.get("channels", {}).items():
-        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
-        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
-
-
-def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
-    if "reason" in gate:
-        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
-    if "channels" not in gate:
-        return
-    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
-    noise = {name: own["noise"] for name, own in gate["channels"].items() if own["noise"]}
-    if not noise:
-        yield "A replay in MuJoCo does not tell whether the file is right, because no channel has a stated noise."
-        return
-    ratios, initial = ({n: gate["channels"][n][key] / noise[n] for n in noise} for key in ("after", "before"))
-    worst = max(ratios, key=lambda name: ratios[name])
-    is_bad = ratios[worst] > _MAX_REPRODUCED_ERROR
-    text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
-    text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
-    yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
-    yield "The unreliable values below may be the cause." if is_bad and unreliable else ""

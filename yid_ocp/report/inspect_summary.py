@@ -1,11 +1,11 @@
-"""Summary of the result of `inspect`, for the terminal and the HTML report."""
+"""Summaries of the results of `inspect` and `export`, for the terminal and the HTML report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from yid_ocp.display import abbreviated_names_text, count_with_noun
+from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, kind_of_part, names_by_kind_text
 from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.report.terminal import (
     SUMMARIES,
@@ -16,10 +16,14 @@ from yid_ocp.report.terminal import (
     TableRows,
     bound_range_text,
     next_steps_table,
+    scale_and_unit_with_metres_as_mm,
     shown_unit,
+    value_text_and_display_unit,
 )
 
 _MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
+_MAX_FORMULA_LINES = 30  # of a shown formula; result.json has longer ones
+_MAX_REPRODUCED_ERROR = 3  # largest error of a replay that reproduces a recording [noise std]
 _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noise then does not hide [std]
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
@@ -29,23 +33,31 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
-    asked = result["asked"] or result["dependence"]
+    asked, entries = result["asked"] or result["dependence"], result["entries"]
+    is_formula_asked = bool(entries) and not result["asked"]
     changes = {n: own["along"] for n, own in result["dependence"].items() if own["along"] is not None and n in asked}
     hidden = [n for n, along in changes.items() if along * _shown_change(result["parameters"][n]) < _MIN_VISIBLE_CHANGE]
-    which = "The chosen parameters" if result["asked"] else "All free parameters"
-    text = f"{which} change the readings visibly. `yid-ocp identifiability` tests if they can be told apart."
+    which = abbreviated_names_text([*changes]) if result["asked"] else "every free parameter"
+    text = f"The readings change visibly with {which}. `yid-ocp identifiability` tests whether they determine it."
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
         text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if changes else "", "conclusion")
+    yield SummaryStatement(text if changes and not is_formula_asked else "", "conclusion")
+    for entry in entries:
+        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g} (SI units)"
+        yield SummaryStatement(f"The value of {entry['title']} at {linear['at']} is {value}.", "conclusion")
+        is_long = (count := len(entry["lines"])) > _MAX_FORMULA_LINES
+        yield CodeBlock("" if is_long else "\n".join(entry["lines"]))
+        yield f"Its formula has {count} lines, which are in result.json (`entries`)." if is_long else ""
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
     yield SummaryStatement(f"The model has {size}.", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
-    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the step matrix A: {radius:.6g})."
+    said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the matrix A of a step: {radius:.6g})."
     yield SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
-    yield SummaryTable(rows, "How much a change of a parameter changes the recorded readings", is_key_table=True)
+    title = "How much a change of a parameter changes the recorded readings"
+    yield SummaryTable(rows, title, is_key_table=True, is_page_only=is_formula_asked)
     title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
     yield SummaryTable(equations, title, is_page_only=not result["asked"])
     rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
@@ -53,14 +65,11 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         entry = result["parameters"][name]
         cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
         rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
-    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters")
-    for entry in result["entries"]:
-        value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
-        yield CodeBlock("\n".join(entry["lines"]))
-        yield CodeBlock("" if entry["zero"] else f"its value is {value} at {linear['at']}")
-    files = ", ".join(("linearisation.h5 (derivatives of the state after a step)", "sparsity.png", *result["exported"]))
-    yield f"The folder has equations.txt (all equations and their names), {files}."
-    yield next_steps_table(result, {"test whether they can be told apart": "identifiability"} if changes else {})
+    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters", is_page_only=is_formula_asked)
+    files = ", ".join(("linearisation.h5 (A and other derivatives of the state after a step)", *result["exported"]))
+    yield f"The folder has equations.txt (all equations and their names), {files}, and sparsity.png (pattern of zeros)."
+    step = "test whether the recordings determine free parameters"
+    yield next_steps_table(result, {step: "identifiability"} if changes and not is_formula_asked else {})
 
 
 def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
@@ -68,8 +77,9 @@ def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
     visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
-    moved: TableRows = [("parameter", "change", "effect on all readings / noise", visible, "most sensitive sensor")]
-    equations: TableRows = [("parameter", "equations", "observed by sensors")]
+    heads = ("effect on all readings / noise", visible, "most sensitive sensor")
+    moved: TableRows = [("parameter", "change (10 % of value or bound)", *heads)]
+    equations: TableRows = [("parameter", "equations", "of these, observed by sensors")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
@@ -97,3 +107,57 @@ def _row_names_text(names: Sequence[str]) -> str:
     """Return names of equations in one line, or only their number if that line would be too long."""
     text = abbreviated_names_text(names)
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
+
+
+@SUMMARIES.register("yid-export/1")
+def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
+    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
+    listed = {
+        name: entry
+        for name, entry in manifest["parameters"].items()
+        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
+    }
+    grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
+    entries = (manifest["effects"] | grasps | listed).items()
+    # a part that is kept in part is lost with another one
+    lost = [n for n, entry in entries if entry["status"] == "not representable" and ". Kept: " not in entry["how"]]
+    said = f"The file lacks {names_by_kind_text(lost)}, so its predictions differ from those of the run."
+    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
+    absent = [n for n, own in manifest["parameters"].items() if own["status"] == "not representable"]
+    unknown = [name for name in manifest["unknown"] if name not in absent]
+    gate = manifest["gate"] or {}
+    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
+    text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the "
+    yield SummaryStatement(f"{text}search ended. Do not rely on them." if unknown else "", "verdict")
+    kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
+    told = ((n, "partly" if ". Kept: " in own["how"] else kinds[own["status"]], own["how"]) for n, own in entries)
+    alike = grouped(((kind_of_part(name), status, how), name) for name, status, how in told)
+    rows: TableRows = [("part of the model", "in the file", "how, or why not")]
+    rows += [(names_by_kind_text(names), *cells) for (_, *cells), names in alike.items()]
+    yield SummaryTable(rows, "Parts of the model in the file")
+    rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
+    for name, entry in gate.get("channels", {}).items():
+        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
+        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
+    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
+
+
+def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
+    """Yield sentences on how well MuJoCo reproduces recordings with an exported file."""
+    if "reason" in gate:
+        yield f"The file is written, but was not tested by a replay in MuJoCo: {gate['reason']}."
+    if "channels" not in gate:
+        return
+    held = "held-out recordings" if gate["which"] == "held_out" else "fitted recordings"
+    noise = {name: own["noise"] for name, own in gate["channels"].items() if own["noise"]}
+    if not noise:
+        yield "A replay in MuJoCo does not tell whether the file is right, because no channel has a stated noise."
+        return
+    ratios, initial = ({n: gate["channels"][n][key] / noise[n] for n in noise} for key in ("after", "before"))
+    worst = max(ratios, key=lambda name: ratios[name])
+    is_bad = ratios[worst] > _MAX_REPRODUCED_ERROR
+    text = f"In MuJoCo, the file {'does not reproduce' if is_bad else 'reproduces'} the {held}: the largest error (of "
+    text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
+    yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
+    yield "Unreliable values may be the cause." if is_bad and unreliable else ""

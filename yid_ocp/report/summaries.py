@@ -228,7 +228,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         yield f"{none}These recordings do not determine {abbreviated_names_text(causes)}. {do}"
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
-        text = f"These parameters are only weakly determined: {abbreviated_names_text(weak)}."
+        text = f"Only weakly determined (± above 10 % and up to 400 %): {abbreviated_names_text(weak)}."
         yield f"{text} Use their 95 % intervals{rough}."
 
 
@@ -280,11 +280,19 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     failed = "Do not use the values, because the fit did not converge. At these values, "
     failed *= result["status"] not in ("converged", "not_solved")
     start = "No fit was made: at the initial values, " * is_initial
-    doubt = f" Only weakly determined: {abbreviated_names_text(weak)}." * bool(weak)
+    open_directions = [own for own in result["directions"] if own["verdict"] != "identifiable"]
+    together = [(own, names) for own in open_directions if len(names := _changed_names(own)) > 1]
+    told = [name for own, names in together if own["verdict"] == "not_identifiable" for name in names]
+    rest = abbreviated_names_text([name for name in weak if name not in told])
+    doubt = f" Only weakly determined (± above 10 % and up to 400 %): {rest}." * bool(rest)
     yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
+    asked = result["what_if"]
+    answer, *details = _what_if_blocks(asked, len(parameters)) if asked else ("",)
+    yield answer
+    allowed = ["unknown initial states"] * (result.get("start") == "unknown")
     if (std := result.get("grasp_std")) is not None:
-        told = f"The ± and verdicts allow for grasps that are displaced by {1e3 * std:g} mm (one standard deviation)."
-        yield SummaryStatement(told, "verdict")
+        allowed.append(f"grasps that are displaced by {1e3 * std:g} mm (one standard deviation)")
+    yield SummaryStatement(f"The ± and verdicts allow for {' and '.join(allowed)}." if allowed else "", "verdict")
     yield from issue_summary_blocks(result)
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
     unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
@@ -297,7 +305,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield said if own != [cause] else f"{cause}."
     yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
-    weak_changes = [*_weak_combined_changes(result["directions"], parameters)]
+    weak_changes = [
+        (", ".join(_change_text(name, own, parameters[name]) for name in names[:_MAX_CHANGES]),)
+        for own, names in together
+        if own["verdict"] == "weak"
+    ]
     said = "Some parameters can replace each other: the recordings hardly change if all parameters of a line change "
     said += "together, as stated in % of their values. Measure the first one in another way and fix it."
     yield said if weak_changes else ""
@@ -306,21 +318,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     if (left := len(hidden[_MAX_DIRECTIONS:]) + len(weak_changes[_MAX_DIRECTIONS:])) > 0:
         yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
-    if (asked := result["what_if"]) is not None:
-        said = "No set of up to three changes makes it possible to find all parameters."
-        if asked["smallest"]:
-            said = f"Fewest changes with which all parameters would be found: {asked['smallest'][0]['words']}."
-        yield SummaryStatement(said, "verdict")
-        rows = [("change", "parameters found", "mean ± [% of that now]")]
-        now = asked["base"]["gain"]
-        changes = {own["words"]: own for own in (asked["base"], *asked["smallest"], *asked["singles"])}
-        for entry in changes.values():
-            is_known = None not in (now, entry["gain"])
-            ratio = percent_number_text(math.exp((now - entry["gain"]) / len(parameters))) if is_known else ""
-            count = f"{entry['identifiable']} of {len(parameters)}" if entry["gain"] is not None else "unknown"
-            rows.append((entry["words"], count, ratio))
-        yield SummaryTable(rows, "What another experiment would find (the smaller the mean ±, the better)")
-        yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
+    yield from details
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
@@ -329,8 +327,6 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
-        first = [row[0].partition(" ")[0] for row in weak_changes[:1]]  # the text asks to fix it
-        name = f"parameters.{(first or unseen or lost or weak)[0]}"
         if asked and asked["smallest"]:
             words = asked["smallest"][0]["words"]
             points = result.get("groups_with_chosen_points", ()) if "seen by" in words else ()
@@ -340,7 +336,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         # servos cannot follow a planned motion exactly, and springs in series need more markers
         elif not result.get("has_servos") and not any("springs in series" in text for text in hidden):
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
-        steps["fix a parameter whose VALUE is known"] = f"solve --set {name}.free=false --set {name}.initial=VALUE"
+        for _, names in sorted(together, key=lambda pair: pair[0]["verdict"] != "weak")[:1]:  # a text asks to fix it
+            options = f"--set parameters.{names[0]}.free=false --set parameters.{names[0]}.initial=VALUE"
+            steps["fix a parameter whose VALUE is known"] = f"solve {options}"
         steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
     allowed_for = " --unknown-grasp" * (result.get("grasp_std") is not None)
     allowed_for += " --unknown-start" * (result.get("start") == "unknown")
@@ -348,20 +346,38 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield next_steps_table(result, steps)
 
 
-def _weak_combined_changes(
-    directions: Sequence[Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]
-) -> Iterator[tuple[str]]:
-    """Yield table rows with the changes of several parameters together that the recordings determine only weakly."""
-    for entry in directions:
-        changes = {name: entry["std_relative"] * part for name, part in entry["components"].items()}
-        order = sorted(changes, key=lambda name: -abs(changes[name]))
-        named = [name for name in order if abs(changes[name]) > _MIN_NAMED_SHARE * abs(changes[order[0]])]
-        if entry["verdict"] == "weak" and len(named) > 1:
-            yield (", ".join(_change_text(name, changes[name], parameters[name]) for name in named[:_MAX_CHANGES]),)
+def _what_if_blocks(asked: Mapping[str, Any], count: int) -> SummaryBlockOrTextIterator:
+    """Yield a statement on the best change of an experiment with `count` parameters, a table of all and their notes."""
+    base, smallest = asked["base"], asked["smallest"]
+    changes = {own["words"]: own for own in (base, *smallest, *asked["singles"])}
+    known = {} if base["gain"] is None else {n: e["gain"] for n, e in changes.items() if e["gain"] is not None}
+    ratios = {n: percent_number_text(math.exp((base["gain"] - gain) / count)) for n, gain in known.items()}
+    said = "No set of up to three changes makes it possible to find all parameters."
+    if base in smallest:
+        best = max(known, key=lambda words: known[words])
+        said = f"The ± becomes smallest with: {best} (mean ± {ratios[best]} % of that now)."
+    elif smallest:
+        said = f"All parameters would be found with: {smallest[0]['words']}."
+    yield SummaryStatement(said, "verdict")
+    rows: TableRows = [("change", "parameters found", "mean ± [% of that now]")]
+    for words, entry in changes.items():
+        found = f"{entry['identifiable']} of {count}" if entry["gain"] is not None else "unknown"
+        rows.append((words, found, ratios.get(words, "")))
+    what = "What another experiment would find (mean ±: smaller is better; each parameter is assumed known to 400 %)"
+    yield SummaryTable(rows, what)
+    yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
 
 
-def _change_text(name: str, relative: float, entry: Mapping[str, Any]) -> str:
-    """Return a parameter's change in % of its value, or in its unit if the value is zero."""
+def _changed_names(direction: Mapping[str, Any]) -> list[str]:
+    """Return the parameters that change along a direction, the largest change first."""
+    parts = direction["components"]
+    order = sorted(parts, key=lambda name: -abs(parts[name]))
+    return [name for name in order if abs(parts[name]) > _MIN_NAMED_SHARE * abs(parts[order[0]])]
+
+
+def _change_text(name: str, direction: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
+    """Return a parameter's change along a direction in % of its value, or in its unit if the value is zero."""
+    relative = direction["std_relative"] * direction["components"][name]
     if entry["value"]:
         return f"{name} {100 * relative:+.3g} %"
     return f"{name} {relative * entry['std'] / entry['std_relative']:+.2g} {entry['unit']}"
@@ -400,9 +416,9 @@ def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield "Do not use this motion, because the model cannot simulate it to its end."
         return
     place, limit = ", ".join(f"{x:.4g}" for x in result["place"]), f"{1e3 * result['tolerance']:g}"
-    near = (limit, "position_tolerance", "mm")
+    near = (limit, "plan.position_tolerance", "mm")
     yield f"The point '{result['point']}' has the target ({place}) m in the world after {result['duration']:g} s."
-    fastest = (f"{1e3 * result['speed_tolerance']:g}", "point_rest_speed_tolerance", "mm/s")
+    fastest = (f"{1e3 * result['speed_tolerance']:g}", "plan.point_rest_speed_tolerance", "mm/s")
     rows: TableRows = [("quantity", "predicted", "limit", "setting of the limit", "unit")]
     rows.append(("largest distance of the point from the target", f"{1e3 * result['error']:.3g}", *near))
     rows.append(("largest speed of any point of the object", f"{1e3 * result['swing']:.3g}", *fastest))
@@ -541,14 +557,14 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     truth = result["truth_errors"]
     heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
-    rows: TableRows = [("point", "images", "± std [mm]", *heads)]
+    rows: TableRows = [("point", "images", "± [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
     yield from issue_summary_blocks(result)
     used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
-    used += "recording.h5 has their points: list it under recordings.estimate of the configuration for `solve`."
+    used += "recording.h5 has their points."
     used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
     yield SummaryStatement(result["refused"] or used, "verdict")
     yield SummaryTable(rows, "Tracked points", is_key_table=True)
@@ -558,3 +574,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
+    steps = {
+        "estimate from these points (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"
+    }
+    yield next_steps_table(result, {} if result["refused"] else steps)

@@ -172,6 +172,7 @@ def _run_batch_task(
     parameters = {parameter: {key: own.get(key) for key in _PARAMETER_KEYS} for parameter, own in free.items()}
     effects = [effect_entry_label(entry) for entry in result.get("effects", ())]
     found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
+    found["explains"] = fit.get("explains")
     found |= {"effects": effects, "parameters": parameters, "seconds": time.perf_counter() - begun}
     return dict(to_json_types(found))
 

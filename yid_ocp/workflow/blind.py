@@ -25,7 +25,7 @@ from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_decision_statistics
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import make_folder, read_input_json, read_input_text, to_json_types, write_strict_json, write_text
@@ -111,7 +111,7 @@ def run_blind(
     proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers, part)
     try:
         commitment, cases = proof.commit()
-        progress.begin_stage(f"diagnosing {len(cases)} cases")
+        progress.begin_stage(f"diagnosing {count_with_noun(len(cases), 'case')}")
         answers = proof.done(_diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.read_labels_checking_sha256(sealed, commitment["sha256"])
@@ -200,11 +200,11 @@ class _Proof:
             what, allowed = f"part {own}/{of} is empty: there are {self.count} cases", f"K/N with N up to {self.count}"
             raise ConfigError(what, where="--slice", allowed=allowed, hint="use fewer parts (N), or more --cases")
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
-        self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
+        self.progress.begin_stage(f"preparing {count_with_noun(len(used), 'experiment')}")
         told = {name: {"experiment": vars(experiments[name])} for name in used}
         tasks = [Task(name, {**told[name], "folder": str(prepared), "name": name}) for name in used]
         self.done(_prepare_experiment, tasks, prepared / "tasks")
-        self.progress.begin_stage(f"simulating {len(plan)} cases")
+        self.progress.begin_stage(f"simulating {count_with_noun(len(plan), 'case')}")
         tasks = []
         for entry in plan:
             name = entry.experiment

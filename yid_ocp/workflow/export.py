@@ -18,7 +18,7 @@ from yid_ocp.config.settings import ParameterSettings, RunSettings, config_yaml_
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
-from yid_ocp.display import Progress, grouped
+from yid_ocp.display import Progress, names_by_kind_text
 from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FeatureExportSupport
@@ -139,7 +139,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
     # a friction law becomes single effects, so that a file can lack one of them
     nominal = added(nominal, by_label({entry.name: entry.value for entry in build_system(nominal).parameters}))
     doubtful = [n for n, own in parameters.items() if own.get("verdict") in ("not_identifiable", "not_trusted")]
-    doubtful += (result.get("to_use") or {}).get("left_out", ())  # of a diagnosis
+    if "model" in result:  # a diagnosis, which has no verdicts of parameters
+        doubtful += (result.get("to_use") or {}).get("left_out", ())
     std = {n: None if n in doubtful else own.get("std") for n, own in parameters.items() if own.get("free")}
     return _CalibratedModel(added(nominal, by_label(values)), nominal, values, std)
 
@@ -159,10 +160,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         what, hint = f"{out.name} already exists, and `export` overwrites nothing", "choose another --out, or remove it"
         raise OutputError(what, where=str(out), allowed="a file that does not exist yet", hint=hint)
     progress.begin_stage("building the model")
-    full, unknown = (
-        build_system(calibrated.settings),
-        [n for n, std in calibrated.parameter_stds.items() if std is None],
-    )
+    full, unknown = build_system(calibrated.settings), [n for n, s in calibrated.parameter_stds.items() if s is None]
     if form == "yaml":
         chosen = settings_by_parameter_name(calibrated.settings, full.parameters)
         for name in calibrated.parameter_stds:
@@ -230,11 +228,8 @@ def _refuse_losses(
     lost += [name for name in absent if name.rpartition(".")[0] not in effects]
     lost += [f"grasp {name}" for name, entry in grasps.items() if entry.loses_motion_or_force]
     if lost and not is_lossy:
-        parts = grouped((name.partition("@")[0] if "@" in name else name.rpartition(".")[2], name) for name in lost)
-        told = ", ".join(
-            f"{kind} ({len(own)} times)" if len(own) > 3 else ", ".join(own) for kind, own in parts.items()
-        )
-        what, where = f"{form.upper()} cannot represent these parts of the model: {told}", f"--format {form}"
+        told, where = names_by_kind_text(lost), f"--format {form}"
+        what = f"{form.upper()} cannot represent these parts of the model: {told}"
         other = "" if form == "mjcf" else "write a MuJoCo model (--format mjcf), which has more parts, or "
         hint = f"{other}add --lossy to leave them out, with a manifest that has the reason for each"
         raise ConfigError(what, where=where, allowed="--lossy, or a model without them", hint=hint)
