@@ -78,15 +78,14 @@ def point_jacobians_and_joint_information(
         whole = np.concatenate(by_state, axis=1) / scale
         blur = scale * _low_rank_error_sensitivity(course, driving.input_errors, whole)
     slopes: dict[tuple[str, str], Array] = {}
-    at = 0
-    for sensor, block in shown:
-        parts = np.concatenate([block, blur[:, at : at + block.shape[1]]], axis=2)
+    *blurs, of_angles = np.split(blur, np.cumsum([block.shape[1] for _, block in shown], dtype=int), axis=1)
+    for (sensor, block), own in zip(shown, blurs, strict=True):
+        parts = np.concatenate([block, own], axis=2)
         parts = parts.reshape(len(parts), -1, 3, parts.shape[2])
         slopes |= {(sensor.group_name, frame): parts[:, k] for k, frame in enumerate(sensor.frame_names)}
-        at += block.shape[1]
     information = np.diag(np.repeat([0.0, 1.0], [len(x), blur.shape[2]]))
     if encoders is not None:
-        told.append(_read_angles(encoders, x, i, blur[:, at:]))
+        told.append(_read_angles(encoders, x, i, of_angles))
     for block in told:
         width = block.shape[1]
         information[:width, :width] += block.T @ block
