@@ -204,8 +204,7 @@ class FirstOrderLag:
         by_time = self._by_time(slow, self._straight(slow, decay, share))
         direct = np.sum(pull * by_time, axis=0) @ self.time_constant_sensitivity
         back = pull.copy()
-        for k in range(len(back) - 2, 0, -1):
-            back[k] += decay * back[k + 1]
+        back[1:] = _filtered(pull[:0:-1], decay)[::-1]
         passed = back.copy()
         passed[2:] *= 1 - share
         passed[1:-1] += (share - decay) * back[2:]
