@@ -131,7 +131,7 @@ def _body(
 
 def _limits(model: Any, j: int) -> SimpleNamespace:
     """Limits of a joint. The effort limit is `actuatorfrcrange` or follows from the forces of its actuators."""
-    lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (None, None)
+    lower, upper = model.jnt_range[j] if model.jnt_limited[j] else (-math.inf, math.inf)
     efforts = [float(np.abs(model.jnt_actfrcrange[j]).max())] if model.jnt_actfrclimited[j] else []
     for i in (i for i in range(model.nu) if model.actuator_trntype[i] == 0 and model.actuator_trnid[i, 0] == j):
         if model.actuator_forcelimited[i]:
@@ -139,7 +139,7 @@ def _limits(model: Any, j: int) -> SimpleNamespace:
         if _is_motor(model, i) and model.actuator_ctrllimited[i]:
             gain = model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
             efforts.append(float(np.abs(model.actuator_ctrlrange[i] * gain).max()))
-    return SimpleNamespace(lower=lower, upper=upper, effort=min(efforts, default=None), velocity=None)
+    return SimpleNamespace(lower=lower, upper=upper, effort=min(efforts, default=math.inf), velocity=math.inf)
 
 
 def _followed_joints(model: Any) -> dict[str, SimpleNamespace]:
@@ -212,7 +212,7 @@ def _joint_name(model: Any, j: int) -> str:
 
 
 def _fixed(name: str, parent: str, child: str, origin: Array) -> SimpleNamespace:
-    limit = SimpleNamespace(lower=None, upper=None, effort=None, velocity=None)
+    limit = SimpleNamespace(lower=-math.inf, upper=math.inf, effort=math.inf, velocity=math.inf)
     own = {"axis": np.array([1.0, 0, 0]), "limit": limit, "mimic": None, "parent": parent, "child": child}
     return SimpleNamespace(name=name, type="fixed", origin=origin, **own)
 

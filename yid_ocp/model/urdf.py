@@ -44,7 +44,7 @@ _PRINCIPAL_MOMENT_ATOL = 1e-12  # likewise, for point masses [kg m^2]
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 INERTIA_TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
-_LIMITS = ("lower", "upper", "effort", "velocity")
+_LIMITS = {"lower": -math.inf, "upper": math.inf, "effort": math.inf, "velocity": math.inf}  # without a limit
 
 _Carrier = str | None
 log = logging.getLogger(__name__)
@@ -250,7 +250,7 @@ def _read_joint(element: ElementTree.Element) -> SimpleNamespace:
     axis, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
     names = {tag: _part(element, tag).attrib["link"] for tag in ("parent", "child")}
     said = {} if limit is None else limit.attrib
-    bounds = {key: float(said[key]) if key in said else None for key in _LIMITS}
+    bounds = {key: float(said.get(key, value)) for key, value in _LIMITS.items()}
     follows = None
     if mimic is not None:
         law = {key: float(mimic.get(key, value)) for key, value in (("multiplier", 1.0), ("offset", 0.0))}
@@ -424,22 +424,16 @@ def _walk(
 
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
     x, y, z = map(float, snap_near_integer_entries(_unit_axis(source)))
-
-    def bound(key: str, otherwise: float) -> float:
-        value = getattr(source.limit, key)
-        return otherwise if value is None or abs(value) >= _UNLIMITED_VALUE else float(value)
-
-    limits = bound("lower", -math.inf), bound("upper", math.inf)
-    limits = (-math.inf, math.inf) if source.type == "continuous" else limits
+    stated = vars(source.limit) | ({"lower": -math.inf, "upper": math.inf} if source.type == "continuous" else {})
+    bounds = ((key, _LIMITS[key] if abs(stated[key]) >= _UNLIMITED_VALUE else float(stated[key])) for key in _LIMITS)
+    limits = {f"{key}_limit": bound for key, bound in bounds}
     kind: Literal["revolute", "prismatic"] = "prismatic" if source.type == "prismatic" else "revolute"
-    efforts = bound("effort", math.inf), bound("velocity", math.inf)
-    return Joint(source.name, kind, parent, placement, (x, y, z), bodies, *limits, *efforts)
+    return Joint(source.name, kind, parent, placement, (x, y, z), bodies, **limits)
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
     """Position at which a joint is locked: the given value, else zero or the nearest limit."""
-    low = -math.inf if joint.limit.lower is None else joint.limit.lower
-    high = math.inf if joint.limit.upper is None else joint.limit.upper
+    low, high = joint.limit.lower, joint.limit.upper
     if joint.type == "continuous" or low > high:
         low, high = -math.inf, math.inf
     return locked.get(joint.name, min(max(0.0, low), high))
