@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.display import abbreviated_names_text
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, parameter_verdict
-from yid_ocp.report import diagnosis_summaries, inspect_summary, summaries, terminal  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, model_summaries, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "data_trusted": True}

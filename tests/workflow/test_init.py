@@ -278,7 +278,8 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     text = Path("run.yaml").read_text()
     assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
-    assert "0.4 N m s/rad  of pitch, as the robot file states" in capsys.readouterr().out
+    assert "0.4 N m s/rad  of pitch, as the robot file states" in (told := capsys.readouterr().out)
+    assert told.count("find friction and payload of the arm too, set sensors.joints.effort.use: true") == 2
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:

@@ -308,9 +308,8 @@ def step_map_natural_frequencies(
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
-        return UndampedStepMapFrequencies(
-            np.zeros(0), message="every coordinate is driven or prescribed, so none vibrates"
-        )
+        message = "every coordinate is driven or prescribed, so none vibrates"
+        return UndampedStepMapFrequencies(np.zeros(0), message=message)
     step = compile_step(still, time_step, force_split, constraint_force_at, use_compiler=False)
     known = np.array([configuration[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)

@@ -296,9 +296,7 @@ class BlindCaseGenerator:
         effects = make_candidate_effects(problem.system, clean, self._candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [held_out])
         _, signatures = linearize_candidates(composed.with_whitening_linearized_at(truth), (), truth)
-        return [
-            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r"))) for s in signatures
-        ]
+        return [(s.effect, s.shape_values, np.linalg.qr(s.projected_sensitivity).R) for s in signatures]
 
     def draw_recordings_and_ground_truth(self, planned: PlannedBlindCase) -> tuple[UnlabelledCase, CaseGroundTruth]:
         """Return the recordings of a planned case, and its label. Raises `ModelError` if no draw can be simulated."""

@@ -282,9 +282,8 @@ def _family(law: TorqueLaw, residual: Array, slopes: Array) -> _Family:
         left = max(total + float(pull @ values), 1e-12 * total, 1e-300)
         shrink = np.linalg.slogdet(precision)[1] - np.linalg.slogdet(matrix)[1]
         evidence = -0.5 * n * math.log(left / n) + 0.5 * float(shrink)
-        families.append(
-            _Family(law, evidence, dict(zip(law.parameters.names, values.tolist(), strict=True)), precision)
-        )
+        by_name = dict(zip(law.parameters.names, values.tolist(), strict=True))
+        families.append(_Family(law, evidence, by_name, precision))
     return max(families, key=lambda family: family.log_evidence)
 
 

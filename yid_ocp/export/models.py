@@ -125,10 +125,9 @@ class FeatureExportSupport:
 
 
 def _worst(parts: Sequence[FeatureExportSupport]) -> FeatureExportSupport:
-    """Return the worst status of several parts, with the explanations of the parts that have it, then the others."""
+    """Return the worst status of several parts, with the explanations of the parts that have it."""
     status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
-    how, kept = (dict.fromkeys(p.how for p in parts if (p.status == status) == own) for own in (True, False))
-    return FeatureExportSupport(status, "; ".join(how) + f". Kept: {', '.join(kept)}" * bool(kept))
+    return FeatureExportSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 
 def _aspect_support(aspect: str, form: str) -> FeatureExportSupport:

@@ -232,9 +232,8 @@ def measurements_located_on_grid(data: SensorData, grid: TimeGrid, where: str) -
     if np.any(seen & ~(data.std > 0)):
         key, allowed = data.sensor.group_name, f"numbers above 0 [{data.sensor.unit}]"
         what = f"{np.sum(seen & ~(data.std > 0))} of {np.sum(seen)} noise stds of {key} are zero or missing"
-        raise DataError(
-            what, where=f"recording '{where}': {key}", allowed=allowed, hint=f"set sensors.{key}.std: NUMBER"
-        )
+        at, hint = f"recording '{where}': {key}", f"set sensors.{key}.std: NUMBER"
+        raise DataError(what, where=at, allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.preceding_node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)

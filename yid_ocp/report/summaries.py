@@ -363,8 +363,7 @@ def _what_if_blocks(asked: Mapping[str, Any], count: int) -> SummaryBlockOrTextI
     for words, entry in changes.items():
         found = f"{entry['identifiable']} of {count}" if entry["gain"] is not None else "unknown"
         rows.append((words, found, ratios.get(words, "")))
-    what = "What another experiment would find (mean ±: smaller is better; each parameter is assumed known to 400 %)"
-    yield SummaryTable(rows, what)
+    yield SummaryTable(rows, "What another experiment would find (each parameter is assumed known to 400 %)")
     yield from (f"Note on '{words}': {own['message']}." for words, own in changes.items() if own["message"])
 
 
@@ -574,7 +573,5 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
     yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
-    steps = {
-        "estimate from these points (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"
-    }
+    steps = {"estimate (RUN: this run folder)": "solve --set 'recordings.estimate=[RUN/recording.h5]'"}
     yield next_steps_table(result, {} if result["refused"] else steps)

@@ -164,8 +164,7 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     fit = result["fit"]
     if fit["explains"]:
         return
-    issues = result.get("issues") or ()
-    still = " ".join(own["setting"] or "" for own in issues if own["cause"] == "weak_excitation")
+    still = " ".join(i["setting"] or "" for i in result.get("issues") or () if i["cause"] == "weak_excitation")
     moving = {key: own for key, own in parameters.items() if f"parameters.{key}.free" not in still}
     lost = {key: own for key, own in moving.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}

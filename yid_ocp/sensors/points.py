@@ -68,9 +68,8 @@ def _points(
             raise DataError(what, where=f"sensors.{group.name}", **said)
     if not known:
         what = f"no recorded point ({', '.join(wanted)}) has the name of a frame of the model"
-        hint = (
-            f"under sensors.{group.name}, set frame_by_recorded_name: {{{', '.join(wanted[:1])}: FRAME}} or use: false"
-        )
+        own, point = f"sensors.{group.name}", ", ".join(wanted[:1])
+        hint = f"set {own}.frame_by_recorded_name: {{{point}: FRAME}} or {own}.use: false"
         listed = unknown_name_error_arguments("", around.system.point_frames or mechanism.frames)["allowed"]
         allowed = f"{listed}, or a location along a segment, such as SEGMENT:40%"
         raise DataError(what, where=where, allowed=allowed, hint=hint)

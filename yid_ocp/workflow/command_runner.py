@@ -19,7 +19,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
-from yid_ocp.report import diagnosis_summaries, inspect_summary, summaries  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, model_summaries, summaries  # noqa: F401, they register
 from yid_ocp.report.terminal import SummaryStatement, aligned_table_lines, summary_blocks, summary_terminal_lines
 
 if TYPE_CHECKING:

@@ -222,12 +222,15 @@ def _summary_lines(
     head = f"`init` chose these settings. Check them{where}:"
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
     lines += dict.fromkeys(f"note: {note}" for recording in recordings for note in recording.notes)
-    quoted = shlex.quote(str(out))
-    return [
-        *lines,
-        "",
-        f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}",
-    ]
+    has_efforts, quoted = "joints.effort" in proposal.noise_by_group, shlex.quote(str(out))
+    is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
+    unseen = "Recorded torques are not used. To let `diagnose` find friction and payload of the arm too, set "
+    lines += [f"{unseen}sensors.joints.effort.use: true."] * is_left_out
+    lines += ["", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
+    if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
+        more = " --set sensors.joints.effort.use=true" * is_left_out
+        lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
+    return [*lines, ""]
 
 
 def _place_sentences(places: Iterable[Any]) -> list[str]:

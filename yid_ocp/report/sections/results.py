@@ -20,7 +20,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.predictions import ChannelPrediction
-from yid_ocp.report import diagnosis_summaries, figures, inspect_summary, summaries, terminal  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, figures, model_summaries, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, animations_to_dict
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.sections import ReportData, draw_figure_per_unit, register_report_section

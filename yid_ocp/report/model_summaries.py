@@ -113,15 +113,11 @@ def _row_names_text(names: Sequence[str]) -> str:
 def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
-    listed = {
-        name: entry
-        for name, entry in manifest["parameters"].items()
-        if (entry["estimated"] or entry["status"] != "native") and name.rpartition(".")[0] not in effects
-    }
+    shown = (n for n, own in manifest["parameters"].items() if own["estimated"] or own["status"] != "native")
+    listed = {n: manifest["parameters"][n] for n in shown if n.rpartition(".")[0] not in effects}
     grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
     entries = (manifest["effects"] | grasps | listed).items()
-    # a part that is kept in part is lost with another one
-    lost = [n for n, entry in entries if entry["status"] == "not representable" and ". Kept: " not in entry["how"]]
+    lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {names_by_kind_text(lost)}, so its predictions differ from those of the run."
     yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
     absent = [n for n, own in manifest["parameters"].items() if own["status"] == "not representable"]
@@ -131,8 +127,7 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the "
     yield SummaryStatement(f"{text}search ended. Do not rely on them." if unknown else "", "verdict")
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
-    told = ((n, "partly" if ". Kept: " in own["how"] else kinds[own["status"]], own["how"]) for n, own in entries)
-    alike = grouped(((kind_of_part(name), status, how), name) for name, status, how in told)
+    alike = grouped(((kind_of_part(name), kinds[own["status"]], own["how"]), name) for name, own in entries)
     rows: TableRows = [("part of the model", "in the file", "how, or why not")]
     rows += [(names_by_kind_text(names), *cells) for (_, *cells), names in alike.items()]
     yield SummaryTable(rows, "Parts of the model in the file")
