@@ -347,7 +347,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
     verdicts = {own["verdict"] for own in free.values()}
-    rows = rows if verdicts - {"not_identifiable"} else []
+    rows = rows if verdicts - {"not_identifiable"} or beside else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
     costs = [entry["whitened_cost"] for entry in methods.values()]
