@@ -228,7 +228,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
     expected = (
         (f"{folder}\n", "" if reached else "a = 1\n")
         if quiet
-        else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
+        else ("a = 1\ndone\n\nrun folder: runs/x\n", "working ...\n")
     )
     assert (captured.out, captured.err) == expected
 

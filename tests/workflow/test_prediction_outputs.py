@@ -178,10 +178,10 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     effort, position = noise["joints.effort"], noise["joints.position"]
     assert (effort["estimated"], position["estimated"]) == (estimated, False)
     assert (effort["bias_std"], position["std"]) == (OFFSET, ANGLE)
-    by_effort, by_position = _noise_cells(noise)
+    by_effort, by_position = _noise_cells(noise, 1.0)
     assert by_effort[2:] == ("0.2 N m", "estimated" if estimated else "stated")
     assert by_position == ("joints.position", "0.0001 rad", "", "stated")
-    [computed] = _noise_cells({"joints.effort": {"std": 0.005, "unit": "N m", "recorded_std": 0.04}})
+    [computed] = _noise_cells({"joints.effort": {"std": 0.005, "unit": "N m", "recorded_std": 0.04}}, 1.0)
     assert computed[3] == "stated 0.04 N m, low-pass filtered, with the noise of the angles"
     calm = problem_with_exact_inputs(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}

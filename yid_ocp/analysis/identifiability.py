@@ -358,8 +358,7 @@ class _Component(NamedTuple):
     unit: str
 
 
-# combinations of a and b: text, value v, its relative change by those of a and b, b for v and a new a, and whether
-# units must be equal
+# combinations of a and b: text, value v, its relative change by those of a and b, b for v and a new a, if units equal
 _Combination = tuple[str, Callable[..., float], Callable[..., tuple[float, float]], Callable[..., float], bool]
 _SERIES, _SUM = "1/{a} + 1/{b}, like springs in series", "{a} + {b}, like parallel springs"
 _COMBINATIONS: tuple[_Combination, ...] = (

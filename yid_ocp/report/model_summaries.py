@@ -120,8 +120,7 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {names_by_kind_text(lost)}, so its predictions differ from those of the run."
     yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
-    absent = [n for n, own in manifest["parameters"].items() if own["status"] == "not representable"]
-    unknown = [name for name in manifest["unknown"] if name not in absent]
+    unknown = [name for name in manifest["unknown"] if not {name, name.rpartition(".")[0]}.intersection(lost)]
     gate = manifest["gate"] or {}
     yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
     text = f"The run has no reliable value of {abbreviated_names_text(unknown)}. The file has the values where the "

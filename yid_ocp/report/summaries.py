@@ -52,12 +52,11 @@ _CLOSED_GAP = 1e-6  # largest distance of hand and object at a grasp that needs 
 @SUMMARIES.register("yid-solve/1")
 def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
-    status = result["status"]
+    status, fit = result["status"], result["fit"]
     failed, converged = status == "failed", status == "converged"
-    is_trusted, is_safe, mild = result["fit"]["data_trusted"], False, issue_descriptions(result, severe=False)
+    is_trusted, is_safe, mild = fit["data_trusted"], False, issue_descriptions(result, severe=False)
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
-        fit = result["fit"]
         yield from misfit_summary_blocks(result, free)
         texts = [*result.get("discretisation_notes", ()), *_bound_sentences(free, fit["explains"])]
         if fit["explains"]:
@@ -74,7 +73,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
-        chi2 = 0.0 if failed else result["fit"]["chi2_per_dof"] or 0.0
+        chi2 = 0.0 if failed else fit["chi2_per_dof"] or 0.0
         is_hopeless = chi2 > HOPELESS_CHI2
         why = result["message"].partition(". Set solver.")[0] if is_hopeless else result["message"]
         said = f"Do not use the values, because {said}: {why.removesuffix('.')}."

@@ -24,6 +24,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.channel_checks import ISSUE_CAUSE_DESCRIPTIONS, Issue, typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.recording import Recording
+from yid_ocp.display import grouped
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import DataError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, step_with_time_step
@@ -196,9 +197,9 @@ def min_grasp_gaps_at_start(problem: EstimationProblem, episode: Episode) -> dic
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
-    if issues := _gravest_first(problem.options.data_issues)[:3]:
-        told = (f"{ISSUE_CAUSE_DESCRIPTIONS[issue.cause]} ({issue.location_text})" for issue in issues)
-        hint = f"{hint}. Issues found before: {'; '.join(told)}"
+    if issues := grouped((own.cause, own) for own in _gravest_first(problem.options.data_issues)):
+        told = [f"{ISSUE_CAUSE_DESCRIPTIONS[cause]} ({own[0].location_text})" for cause, own in issues.items()]
+        hint = f"{hint}. Issues found before: {'; '.join(told[:3])}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_grasp_gaps_at_start(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
@@ -386,8 +387,10 @@ def _raise_for_issues(run: RunSettings, issues: Sequence[Issue]) -> None:
 
 
 def _gravest_first(issues: Sequence[Issue]) -> list[Issue]:
-    # an issue of all joints explains those of single ones
-    return sorted(issues, key=lambda own: (own.severity == "warning", "." in own.channel, -own.limit_violation_ratio))
+    strongest = sorted(issues, key=lambda own: -own.limit_violation_ratio)
+    causes = [own.cause for own in strongest]
+    # an issue of all joints explains those of single ones with the same cause
+    return sorted(strongest, key=lambda own: (own.severity == "warning", causes.index(own.cause), "." in own.channel))
 
 
 def issues_to_plain_data(issues: Sequence[Issue]) -> list[dict[str, Any]]:
