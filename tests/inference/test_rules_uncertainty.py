@@ -424,7 +424,7 @@ def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
         (1.0449, True, "explains the recordings to within their noise (chi2 per degree of freedom is 1.04; noise al"),
         (2.75, True, "larger than noise usually leaves them"),
         (9.0, False, "does not explain the recordings (chi2 per degree of freedom is 9; noise alone gives 1)"),
-        (1e4, False, "check units, signs and names and run"),
+        (1e4, False, "check units, signs, names and noise and run"),
     ],
 )
 def test_a_fit_is_told_with_its_misfit(chi2, explains, words):

@@ -141,7 +141,7 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
 
 def _few_samples(recording: Recording, span: float) -> Iterator[Issue]:
     groups, least = recording.joint_and_point_groups, QUALITY_LIMITS.min_samples
-    counts = [int(np.sum(group.t - group.t[0] <= span)) for group in groups]
+    counts = [int(np.sum(group.t - group.t[0] <= span * (1 + 1e-9))) for group in groups]
     for group, count in zip(groups, counts, strict=True):
         if count < least:
             # angles between so few samples are unknown; a few frames beside a dense group still tell something

@@ -51,7 +51,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
-        "insufficient_data": "Record longer and larger motions, with more points in view, or free fewer parameters.",
+        "insufficient_data": "Record longer and larger motions, or free fewer parameters.",
         "unknown": _said((result.untried, _longer_search(result)), (movable, most), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
@@ -84,7 +84,7 @@ def _changed(result: DiagnosisResult) -> bool:
 
 def _longer_search(result: DiagnosisResult) -> str:
     used = sum(result.stage_seconds.values())
-    return f"To try the rest, remove diagnosis.budget, or set it far above the {used:.0f} s that this diagnosis took."
+    return f"To try the rest, remove diagnosis.budget, or set it far above the {used:.0f} s that the search took."
 
 
 def _short(number: float) -> str:

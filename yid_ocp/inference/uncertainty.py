@@ -498,7 +498,7 @@ def goodness_of_fit_message(fit: Mapping[str, Any]) -> str:
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    what = "units, signs and names" if chi2_per_dof * fraction**2 > HOPELESS_CHI2 else "the stated noise"
+    what = "units, signs, names and noise" if chi2_per_dof * fraction**2 > HOPELESS_CHI2 else "the stated noise"
     return f"{said} To find the cause, check {what} and run `yid-ocp diagnose`."
 
 

@@ -148,7 +148,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
         if result.get("format") != "yid-solve/1":  # whose table has the values
             yield "Values to use (± is one standard deviation):"
             yield CodeBlock("\n".join(use["values"]))
-            yield f"Too uncertain, so not listed: {lost}." if lost else ""
+            yield f"Not known to within 10 %, so not listed: {lost}." if lost else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():

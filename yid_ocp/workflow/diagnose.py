@@ -160,10 +160,11 @@ def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, An
     """
     fit, system = finding.final_model, finding.final_model.problem.system
     sizes, estimates = uncertainty.typical_parameter_magnitudes(fit.problem, fit.unknowns), {}
+    added = [own.label for own in finding.accepted_effects]
     for name in fit.problem.shared_parameters:
         entry, value, std = system.parameters[name], fit.values[name], fit.std[name]
         verdict = uncertainty.verdict_by_relative_std(value, std, sizes[name])
-        verdict = "identifiable" if verdict == "weak" and "@" in name else verdict
+        verdict = "identifiable" if verdict == "weak" and name.rpartition(".")[0] in added else verdict
         told = entry.unit, entry.value, entry.lower, entry.upper
         estimates[name] = uncertainty.ParameterEstimate(value, std, *told, True, verdict)
     effects = [f"  - {{kind: {own.kind}, location: {own.location}}}" for own in finding.accepted_effects]
