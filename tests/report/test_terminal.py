@@ -142,7 +142,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
         fit = BAD | {"noise_fraction": fraction}
         text = " ".join(told("yid-solve/1", solved(fit=fit, parameters=lost, issues=issues)))
         assert ("start values of k (1.3e+06 N m/rad): near them" in text) == (name == "b"), "k does not move"
-        assert ("noise alone, 0.1 times the stated std, gives 1" in text) == (fraction < 1)
+        assert ("noise alone gives 1, with 0.1 times the stated std" in text) == (fraction < 1)
         unknown = "A better model may find what cannot be found now." in text
         assert (unknown, "do not determine" in text, "--what-if" in text) == (True, False, False)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
@@ -195,7 +195,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
-    rest = "Half the time step would change no estimate by more than its ±."
+    rest = "Checked: half the time step would change no estimate by more than its ±."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "For a smaller ±, set model.object.links: 8, and solve again."
     assert lines[at + 1 : at + 4] == ["includes this.", rest, cure]

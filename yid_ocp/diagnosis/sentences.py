@@ -22,6 +22,7 @@ _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is 
 _MAX_NAMED = 5  # number of named parameters, the most significant changes first, and of named events and places
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
+_LONGER_SEARCH = "To try the rest, remove diagnosis.budget, or raise it."
 GAP_ORIGIN_TEXTS = {
     "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
     "sensor": "a sensor, not the mechanics",
@@ -52,7 +53,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
         "insufficient_data": "Record longer and larger motions, or free fewer parameters.",
-        "unknown": _said((result.untried, _longer_search(result)), (movable, most), (True, larger))[0],
+        "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
@@ -80,11 +81,6 @@ def _changed(result: DiagnosisResult) -> bool:
     """Whether a parameter changed significantly since the earlier runs."""
     since = result.baseline_comparison
     return since is not None and bool(since.significant_parameter_shifts)
-
-
-def _longer_search(result: DiagnosisResult) -> str:
-    used = sum(result.stage_seconds.values())
-    return f"To try the rest, remove diagnosis.budget, or set it far above the {used:.0f} s that the search took."
 
 
 def _short(number: float) -> str:
@@ -215,7 +211,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
-    blocks = "Every second block of time is held out (recordings.held_out: none). Only `yid-ocp solve` fits all data."
+    blocks = "Every second block of time is held out, as recordings.held_out is empty. Only `solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
     divided = result.nominal_model.problem.options.divided_links_model
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
@@ -226,7 +222,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (result.unknown_reason, _reason(result)),
         (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
-        (result.untried, (f"{limit}{listed(result.untried)}.", _longer_search(result))),
+        (result.untried, (f"{limit}{listed(result.untried)}.", _LONGER_SEARCH)),
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),

@@ -287,7 +287,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     said += [] if alike is None else _history_sentences(alike)
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
-    yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True, links=links)
+    yield SummaryTable(rows, "Fit of each run (± is one standard deviation)", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
     for (name, unit), values in found.items():
         if len(values) > 1:
@@ -418,7 +418,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    text = f"Use the law '{best}' for these joints: {joints}. Its"
+    text = f"Use the law '{best}' for these joints: {joints}"
+    text += f", with recordings that also determine {lost}. Its" if lost else ". Its"
     is_absent = bool(friction) and all(shown[name] == "–" for name in friction)
     if not chosen["converged"]:
         text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge. Its"
@@ -438,8 +439,6 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     sure = [name for name in friction if "@" in name and fitted[name]["verdict"] == "identifiable"]
     rubbing = abbreviated_names_text(list(dict.fromkeys(name.rpartition(".")[0].rpartition("@")[2] for name in sure)))
     yield f"Friction beyond viscous friction is found at: {rubbing}." if sure else ""
-    said = f"These recordings do not determine {lost}."
-    yield SummaryStatement(said if lost and result["laws"][best]["converged"] else "", "verdict")
     yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")

@@ -208,7 +208,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         elif tried:
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
-        said.append(f"{' or '.join(quiet).capitalize()} would change no estimate by more than its ±.")
+        said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
     return said + ([f"For a smaller ±, set {' and '.join(cures)}, and solve again."] if cures else [])
 
 

@@ -81,7 +81,7 @@ def print_result(
     elif arguments.quiet:
         print(path)
     else:
-        print("\n".join([*texts(), "", footer]).lstrip())
+        print(("\n".join(texts()).rstrip() + f"\n\n{footer}").lstrip())
 
 
 def worker_config_from_arguments(arguments: argparse.Namespace) -> WorkerConfig | None:

@@ -73,7 +73,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
         raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
     contents: dict[str, Any] = {"notes": []}
-    texts: list[str] = []
+    texts = ["The files have the measured and the predicted signals of the run."]
     if source.is_dir():
         files, notes = _export_run_signals(source, out)
     else:

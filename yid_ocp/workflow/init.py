@@ -217,7 +217,7 @@ def _summary_lines(
     for group, own in proposal.point_placements.items() if proposal.has_object else ():
         if "." not in group and own and {place.frame for place in own} <= {"", proposal.holder_frame}:
             frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
-            lost.append(f"warning: no point of {group} is on the object, so `check` would stop. Set {frames} or {use}")
+            lost.append(f"warning: no point of the group {group} is on the object. Set {frames} or {use}")
     where = f" in the picture {out.with_suffix('.html')}" * has_picture
     head = f"`init` chose these settings. Check them{where}:"
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
@@ -226,7 +226,8 @@ def _summary_lines(
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used. To let `diagnose` find friction and payload of the arm too, set "
     lines += [f"{unseen}sensors.joints.effort.use: true."] * is_left_out
-    lines += ["", f"next: yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
+    first = "follow the warnings, then " * bool(lost)
+    lines += ["", f"next: {first}yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
     if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
         more = " --set sensors.joints.effort.use=true" * is_left_out
         lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
