@@ -544,7 +544,7 @@ def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.Captur
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = proposed(moved(SHORT, far=3.0))
-    assert re.search("(?s)--length and --point-frame.*no point of the group points is on the object", capsys.readouterr().out)
+    assert re.search("(?s)--length and --point-frame.*no point of the group points is on", capsys.readouterr().out)
     assert not run.sensors["points"].frame_by_recorded_name
     # and `check` says what is missing
     assert main(["check", "run.yaml"]) == 2
