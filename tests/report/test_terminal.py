@@ -218,10 +218,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `gauss_newton (best)`: all methods agree within their ± on the parameters that are"
     lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (
-        said,
-        True,
-    )
+    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (said, True)
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
