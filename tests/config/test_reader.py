@@ -304,6 +304,7 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
         ('description: "a\\0b"', "null character"),
         ("? [a, b]\n: 3", "no key"),
         ("a: 1\n---\nb: 2", "not valid YAML"),
+        ('description: "two "springs"\n', "after a closing quote"),
         ("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", r"line 3: problem\.use_compiler"),
     ],
 )

@@ -291,6 +291,8 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     # a name that says nothing is not guessed
     path.write_text("t,j0\n0,1\n1,2\n", encoding="utf-8")
     refused(path, "meaning is not known: j0")
+    path.write_text("t,a_current,b_current\n0,1,1\n1,2,2\n", encoding="utf-8")
+    assert "--columns '*_current=effort:*' --units effort=A" in refused(path, "meaning is not known").hint
 
 
 @pytest.mark.parametrize(

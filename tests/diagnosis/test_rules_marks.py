@@ -422,3 +422,5 @@ def test_slices_count_together_only_with_one_hash(tmp_path, changes, words):
     first, other = written_slice(tmp_path, "1/2", (0, 2)), written_slice(tmp_path, "2/2", (1, 3), **changes)
     with pytest.raises(DataError, match=words):
         score_joined_slices([first, other], tmp_path / "joined")
+    with pytest.raises(DataError, match="no slice"):
+        score_joined_slices([tmp_path], tmp_path / "joined")

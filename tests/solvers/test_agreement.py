@@ -196,7 +196,7 @@ def test_iteration_limit_is_a_status_with_the_best_point(make_problem, pendulum)
         solution = fit_problem(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
-        assert "iterations" in solution.message
+        assert "Set solver.max_iterations: 200" in solution.message
 
 
 def test_more_memory_than_there_is_ends_with_a_status(pendulum, monkeypatch, caplog):

@@ -41,6 +41,7 @@ _RUN_FOLDER_ENDING = re.compile(
     r"(-(check|compare|diagnose|friction|identifiability|inspect|plan|report|simulate|track))?-\d{8}-\d{6}(-\d+)?$"
 )
 _YAML_FAULTS = {  # what the parser says: in plain words, and the cure
+    "found '<scalar>'": ("text after a closing quote or bracket, or no key", "write KEY: 'a \"quoted\" word'"),
     "expected <block end>": ("its indentation differs from that of the lines above", "indent it like its section"),
     "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
     "cannot start any token": ("a tab, or a character that needs quotes", "indent by spaces, and quote such text"),

@@ -52,10 +52,10 @@ def score_joined_slices(
     found: list[dict[str, Any]] = []
     for file in files:
         path = Path(file) / "slice.json" if Path(file).is_dir() else Path(file)
-        part = read_input_json(path)
+        part = {} if Path(file).is_dir() and not path.exists() else read_input_json(path)
         if part.get("format") != _SLICE_FORMAT:
-            what, hint = "the file is no part of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
-            raise DataError(what, where=str(path), allowed=f"a file of the format {_SLICE_FORMAT}", hint=hint)
+            what, hint = "this is no slice of a blind test", "give a folder of `yid-ocp blind`, or its slice.json"
+            raise DataError(what, where=str(file), allowed=f"a file of the format {_SLICE_FORMAT}", hint=hint)
         _, digest = blind.labels_json_and_sha256(_labels(part))
         if digest != part["labels_sha256"] or _ensemble_sha256(part) != part["ensemble_sha256"]:
             what, hint = "the labels or settings do not match the hashes in the file", "copy the original file again"

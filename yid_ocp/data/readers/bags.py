@@ -100,7 +100,7 @@ class OpenBag:
                 hint = f"check it by `{tool} info {self.path}`; if it is sound, cut it into shorter bags"
             elif self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
                 what = "the bag cannot be read, because its folder has no metadata.yaml"
-                hint = f"name tables one by one; if the folder is a bag, {hint}"
+                hint = f"name the files in it (.mcap, .db3, tables) one by one; if the folder is a bag, {hint}"
             elif self.path.is_file() and not self.path.stat().st_size:
                 what, hint = "the bag cannot be read, because it is empty (0 bytes)", "copy it again from the recorder"
             elif "Profile is not ros2" in str(error):  # as rosbags says it

@@ -428,11 +428,10 @@ def _meanings(
         raise DataError(what, where=where, allowed="a column named t or time, in seconds", hint=hint)
     if unknown:
         what = f"columns whose meaning is not known: {', '.join(unknown)}"
-        skipped = ",".join(f"{name}={base.SKIP_COLUMN_KEYWORD}" for name in unknown)
-        meaning = f"'{unknown[-1]}=position:JOINT'"
-        if "current" in unknown[-1].lower():
-            meaning = f"'{unknown[-1]}=effort:JOINT' --units effort=A --torque-constants JOINT=N_M_PER_A"
-        hint = f"give a meaning, such as --columns {meaning}, or leave columns out: --columns '{skipped}'"
+        pattern, meaning = re.sub(r"(?i).+(?=_current$)", "*", unknown[-1]), "position:JOINT"
+        if "current" in pattern.lower():
+            meaning = f"effort:{'*' if '*' in pattern else 'JOINT'}' --units effort=A --torque-constants '*=N_M_PER_A"
+        hint = f"give each a meaning, such as --columns '{pattern}={meaning}', or leave it out: '{unknown[-1]}=skip'"
         raise DataError(what, where=where, allowed=f"{_ALLOWED}, and a unit if it is not SI: q_elbow [deg]", hint=hint)
     return list(meanings.values()), units
 
