@@ -304,17 +304,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         yield said if own != [cause] else f"{cause}."
     yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
-    weak_changes = [
-        (", ".join(_change_text(name, own, parameters[name]) for name in names[:_MAX_CHANGES]),)
-        for own, names in together
-        if own["verdict"] == "weak"
-    ]
+    loose = [(own, names[:_MAX_CHANGES]) for own, names in together if own["verdict"] == "weak"]
     said = "Some parameters can replace each other: the recordings hardly change if all parameters of a line change "
     said += "together, as stated in % of their values. Measure the first one in another way and fix it."
-    yield said if weak_changes else ""
-    rows = [("changes together (one standard deviation)",), *weak_changes[:_MAX_DIRECTIONS]]
+    yield said if loose else ""
+    texts = (", ".join(_change_text(n, own, parameters[n]) for n in names) for own, names in loose[:_MAX_DIRECTIONS])
+    rows = [("changes together (one standard deviation)",), *((text,) for text in texts)]
     yield SummaryTable(rows, "Changes that the recordings hardly show")
-    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(weak_changes[_MAX_DIRECTIONS:])) > 0:
+    if (left := len(hidden[_MAX_DIRECTIONS:]) + len(loose[_MAX_DIRECTIONS:])) > 0:
         yield f"{left} more combinations of parameters are in result.json (`directions`)."
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     yield from details

@@ -211,6 +211,11 @@ class SolverWithCheckedSettings:
         check_option_bounds(self, f"solver {self.name}")
 
 
+def iteration_limit_message(max_iterations: int, searcher: str = "the search") -> str:
+    """Return that a search reached its limit, with advice: twice as much, and at least the default of most solvers."""
+    return f"{searcher} reached its limit. Set solver.max_iterations: {max(2 * max_iterations, 200)}"
+
+
 SOLVERS: Registry[type[Solver]] = Registry("solver")
 
 

@@ -105,8 +105,7 @@ class GaussNewton(base.SolverWithCheckedSettings):
                     message = f"{last}, and moved no estimated value by more than a tenth of its standard deviation"
                     return replace(ended(base.Status.CONVERGED, message), stopped_at_noise_level=True)
             if len(recorder.history) > self.max_iterations:
-                limit = f"the search reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 200)}"
-                return ended(base.Status.ITERATION_LIMIT, limit)
+                return ended(base.Status.ITERATION_LIMIT, base.iteration_limit_message(self.max_iterations))
             # the linear model holds for a change by a factor, but not for a step to a bound at zero
             guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
@@ -218,8 +217,7 @@ class SingleShooting(base.SolverWithCheckedSettings):
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: base.Status.CONVERGED, 1: base.Status.ITERATION_LIMIT}.get(result.status, base.Status.STALLED)
-        limit = f"the search reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 200)}"
-        words = {0: "the cost no longer falls", 1: limit}
+        words = {0: "the cost no longer falls", 1: base.iteration_limit_message(self.max_iterations)}
         message = words.get(result.status, f"no minimum was found ({result.message}). Use gauss_newton")
         return recorder.solver_result_with_iterates(status, message, best.x, warm)
 

@@ -157,8 +157,8 @@ class MultipleShooting(base.SolverWithCheckedSettings):
         if returned in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
             return base.Status.CONVERGED, f"IPOPT found a minimum. {closed}"
         if returned == "Maximum_Iterations_Exceeded":
-            limit = f"IPOPT reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 200)}. {closed}"
-            return base.Status.ITERATION_LIMIT, limit
+            limit = base.iteration_limit_message(self.max_iterations, "IPOPT")
+            return base.Status.ITERATION_LIMIT, f"{limit}. {closed}"
         return base.Status.STALLED, f"IPOPT found no minimum ({returned}). {closed}. Use gauss_newton"
 
     def _by_condensing(
@@ -209,7 +209,7 @@ class MultipleShooting(base.SolverWithCheckedSettings):
                     reason = trial if isinstance(trial, str) else "no step lowers the cost or the defects"
                     return ended(base.Status.STALLED, f"{reason}. Set a shorter node_interval, or use gauss_newton")
                 mu = max(mu * 30.0, 1e-4)
-        end = f"the search reached its limit. Set solver.max_iterations: {max(2 * self.max_iterations, 200)}"
+        end = base.iteration_limit_message(self.max_iterations)
         return ended(base.Status.ITERATION_LIMIT, f"{end}. Jumps at nodes reach {now.defect:.1e}, and should be near 0")
 
 
