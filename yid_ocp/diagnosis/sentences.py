@@ -64,7 +64,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
     """Summarise a diagnosis in lines: may the model be used, is there a gap and why, what else matters, what to do."""
     step, since, notes = result.stated_and_used_time_step[1], result.baseline_comparison, _notes(result)
-    text = [_lead(result)]
+    pushes = _pushes(result)
+    text = [_lead(result), *(found for found, _ in pushes)]
     text += {"insufficient_data": [], "no_gap": _why_no_gap(result)}.get(result.verdict, _why_gap(result))
     text += [] if result.law is None else [result.law.sentence]
     text += [*(cut.sentence(step) for cut in result.truncated_recordings), *_bound_by_priors(result)]
@@ -72,7 +73,7 @@ def diagnosis_summary_text(result: DiagnosisResult) -> str:
     text += [] if result.counterfactual is None else result.counterfactual.sentences
     text += [note for note, _ in notes]
     text += result.events.overspeed_sentences(result.thresholds.max_joint_speed)
-    steps = [*dict.fromkeys([*filter(None, (step for _, step in notes)), result.next_experiment])]
+    steps = [*dict.fromkeys([*filter(None, (step for _, step in (*notes, *pushes))), result.next_experiment])]
     numbered = " ".join(f"{i}. {step}" for i, step in enumerate(steps, 1))
     return "\n".join([*text, f"Do next: {_said((steps[1:], numbered), (True, steps[-1]))[0]}"])
 
@@ -92,9 +93,9 @@ def _lead(result: DiagnosisResult) -> str:
     tests, limits = (result.nominal_test, result.nominal_held_out_test), result.thresholds
     fitted, other = (_short(test.chi2_per_dof) for test in tests)
     sizes = f"chi2 per degree of freedom is {fitted} on fitted and {other} on held-out motions; noise alone gives 1"
-    chance = f"so large an error with the probability p {p_value_text(min(test.p_value for test in tests), '= ')}"
+    chance = f"p-value {p_value_text(min(test.p_value for test in tests), '= ')}"
     best, along = _best_candidate(result)
-    large = f"Your model (the nominal model) has an error beyond noise (a gap): {sizes}, and {chance}."
+    large = f"Your model (the nominal model) has an error beyond noise (a gap): {sizes} ({chance})."
     small = f"In total the error of your model (the nominal model) is within noise: {sizes}. "
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
     gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
@@ -194,9 +195,18 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     return [where, closed, *sizes, *_remains(result)]
 
 
+def _pushes(result: DiagnosisResult) -> list[tuple[str, str]]:
+    """A sentence on brief disturbances, with one on what to do next, if there are any."""
+    events = result.events.disturbances
+    told = listed([event.text for event in events], max_entries=_MAX_NAMED)
+    left_out = f"The tests leave out {count_with_noun(len(events), 'brief disturbance')}: {told}."
+    check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
+    return _said((events, (left_out, check)))
+
+
 def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     """What limits the diagnosis, such as the reason to name no cause: sentences, each with one on what to do next."""
-    scores, models, events = result.screening.candidate_scores, result.single_effect_models, result.events.disturbances
+    scores, models = result.screening.candidate_scores, result.single_effect_models
     level = result.thresholds.gap_significance_level / max(len(scores), 1)
     kind = "".join([fit.effects[0].kind for fit in models[:1]])
     alike = [s.effect for s in scores if s.p_value < level and s.effect.kind == kind and not s.effect.is_local]
@@ -206,9 +216,6 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     limit = f"Not tried because of the time limit (diagnosis.budget: {result.thresholds.budget} s): "
     laws = listed([entry.effect.label for entry in result.selected_effects if entry.effect.is_joint_friction])
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
-    told = listed([event.text for event in events], max_entries=_MAX_NAMED)
-    left_out = f"The tests leave out {count_with_noun(len(events), 'brief disturbance')}: {told}."
-    check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "Every second block of time is held out, as recordings.held_out is empty. Only `solve` fits all data."
@@ -226,7 +233,6 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
-        (events, (left_out, check)),
         (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),
     )
 
@@ -239,14 +245,14 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = f"every tried effect has a size below {limits.min_z:g} times its ± or explains too little of the error"
+    tried = f"no tried effect has a size above {limits.min_z:g} times its ± and explains enough of the error"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
-    more = f"Only these kinds were tried: {', '.join(kinds)}. To try all effects, set diagnosis.candidates: all."
+    more = f"Only these kinds could be tried: {', '.join(kinds)}. To try all effects, set diagnosis.candidates: all."
     more *= len(kinds) <= _FEW_KINDS
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
-    unlike = f"no tried effect resembles the error better than chance (p below {limits.significance_level:g})"
+    unlike = f"the error resembles no tried effect (no p-value is below {limits.significance_level:g})"
     failed = "every refit with an effect failed"
     causes = (result.untried, stopped), (result.record.refits, failed), (True, unlike)
     none = _said((result.single_effect_models, tried), *causes)[0]

@@ -122,8 +122,8 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
     """Return table rows of the candidates that were fitted, and of the others with their forecasts."""
-    fitted: TableRows = [("effect", "parameters", "removed error", "p-value of noise alone", "verdict")]
-    others: TableRows = [("effect", "forecast parameters", "p-value of noise alone", "verdict")]
+    fitted: TableRows = [("effect", "parameters", "removed error", "p-value of forecast", "verdict")]
+    others: TableRows = [("effect", "forecast parameters", "p-value of forecast", "verdict")]
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
     added = {effect_entry_label(own): chosen for own in result.get("effects", ())}
@@ -140,7 +140,8 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
         label = effect_entry_label(entry)
         ends = (p_value_text(entry["p_value"]), verdicts.get(label, ""))
         if entry["closure"] is not None:
-            fitted.append((label, ", ".join(values), f"{100 * entry['closure']:.3g} %", *ends))
+            percent = f"{100 * abs(entry['closure']):.3g} %"
+            fitted.append((label, ", ".join(values), "adds " * (entry["closure"] < 0) + percent, *ends))
         elif label in added:
             fitted.append((label, ", ".join(values), "fitted beside others only", *ends))
         elif label in verdicts or entry["p_value"] < DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level:
@@ -418,15 +419,16 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    text = f"Use the law '{best}' for these joints: {joints}"
-    text += f", with recordings that also determine {lost}. Its" if lost else ". Its"
+    text = f"Use the law '{best}' for these joints: {joints}. Its"
+    if lost:
+        text = f"The law '{best}' predicts best, but first record motions that determine {lost} ({joints}). Its"
     is_absent = bool(friction) and all(shown[name] == "–" for name in friction)
     if not chosen["converged"]:
         text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge. Its"
     elif is_absent:
         text = f"Use no friction law, because these recordings do not show friction of {joints}. Of '{best}', the"
-    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). It is the simplest law whose error exceeds "
-    text += f"the smallest one by no more than chance allows. Each motion was held out in turn: {kinds}."
+    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). No simpler law predicts as well, apart from "
+    text += f"chance. Each motion was held out in turn: {kinds}."
     yield SummaryStatement(text, "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."

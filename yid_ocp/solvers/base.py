@@ -371,20 +371,23 @@ class _MultiStartSearch:
         note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again = self._no_better_minimum(x, note)
-            again = again or _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
+            again = self._fit_from_other_start(x, note)
         except YidError as error:
             # a failed restart must not lose the present fit
             log.info("no fit from there: %s", error)
             return
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
-    def _no_better_minimum(self, x: Array, note: str) -> _Fit | None:
-        """The best fit if a coarse search with its whitening leads from `x` to it or to a worse one; else None."""
+    def _fit_from_other_start(self, x: Array, note: str) -> _Fit:
+        """The fit from `x`. With process noise, a coarse search with the best fit's whitening goes first.
+
+        If that search ends at the best fit or a worse minimum, the best fit is returned.
+        """
         best, coarse = self._best, getattr(self._solver, "with_coarse_tolerances", None)
+        callback = _noting(self._callback, note)
         if coarse is None or not (best.evaluation.ok and self._problem.has_process_noise):
-            return None
-        noted, reached = _noting(self._callback, note) or (lambda entry: None), list[bool]()
+            return _fit_from(self._problem, self._solver, x, callback)
+        noted, reached = callback or (lambda entry: None), list[bool]()
         # along an unknown that the data hardly inform the better end counts, beyond the solver's own tolerance
         least = max(_MIN_COST_GAIN_OF_START, getattr(self._solver, "cost_tolerance", 0.0) * best.evaluation.cost)
 
@@ -398,7 +401,7 @@ class _MultiStartSearch:
         near = _minimize_cost(coarse, best.weighted, x, watched)
         is_worse = bool(near.history) and near.history[-1].cost > _MAX_COST_RATIO_OF_START * best.evaluation.cost
         if near.status == Status.FAILED or not (is_worse or near.stopped_by_callback):
-            return None
+            return _fit_from(self._problem, self._solver, near.x, callback)
         same = replace(best.result, stopped_by_callback=near.stopped_by_callback and not reached)
         return replace(best, result=same, n_evaluations=near.n_evaluations, history=near.history)
 
