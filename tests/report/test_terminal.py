@@ -233,7 +233,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
-    base = {"words": "none (the experiment as it is)", "identifiable": 0, "gain": None, "message": ""}
+    base = {"words": "none (the experiment as it is)", "identifiable": 0, "gain": None, "message": "", "changes": []}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
@@ -245,6 +245,11 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     at = lines.index("estimate from FILE, a recording with a weld:")
     assert lines[at + 1].endswith("'recordings.estimate=[FILE]'")
     assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"
+    for change, is_used in (("camera:tip", True), ("rate:30", False)):
+        best = base | {"words": "a point, seen well", "changes": [change]}
+        more = {"what_if": asked | {"smallest": [best]}, "groups_with_chosen_points": ["points"]}
+        said = " ".join(told("yid-identifiability/1", result | more))
+        assert ("[FILE]' --set sensors.points.used_points=null" in said) == is_used
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():

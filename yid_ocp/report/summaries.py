@@ -318,16 +318,19 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
-    steps = {"fit, for estimates with intervals": "identifiability"} if is_initial and (found or weak) else {}
+    flags = " --unknown-grasp" * (result.get("grasp_std") is not None)
+    flags += " --unknown-start" * (result.get("start") == "unknown")
+    steps = {"fit, for estimates with intervals": f"identifiability{flags}"} if is_initial and (found or weak) else {}
     steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
-    more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
+    more = {"compute exact intervals, which may be asymmetric": f"identifiability --intervals all{flags}"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
         if asked and asked["smallest"]:
-            words = asked["smallest"][0]["words"]
-            points = result.get("groups_with_chosen_points", ()) if "seen by" in words else ()
+            best = asked["smallest"][0]
+            has_new_points = any(change.partition(":")[0] in ("camera", "arm") for change in best["changes"])
+            points = result.get("groups_with_chosen_points", ()) if has_new_points else ()
             options = "".join(f" --set sensors.{group}.used_points=null" for group in points)
-            why = f"estimate from FILE, a recording with {words}"
+            why = f"estimate from FILE, a recording with {best['words']}"
             steps[why] = f"solve --set 'recordings.estimate=[FILE]'{options}"
         # servos cannot follow a planned motion exactly, and springs in series need more markers
         elif not result.get("has_servos") and not any("springs in series" in text for text in hidden):
@@ -335,10 +338,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         for _, names in sorted(together, key=lambda pair: pair[0]["verdict"] != "weak")[:1]:  # a text asks to fix it
             options = f"--set parameters.{names[0]}.free=false --set parameters.{names[0]}.initial=VALUE"
             steps["fix a parameter whose VALUE is known"] = f"solve {options}"
-        steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
-    allowed_for = " --unknown-grasp" * (result.get("grasp_std") is not None)
-    allowed_for += " --unknown-start" * (result.get("start") == "unknown")
-    steps = {why: text + allowed_for * text.startswith("identifiability") for why, text in steps.items()}
+        steps |= {} if asked else {"rank other experiments (takes minutes)": f"identifiability --what-if{flags}"}
     yield next_steps_table(result, steps)
 
 
