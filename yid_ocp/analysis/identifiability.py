@@ -343,9 +343,8 @@ def _sparse_basis(vectors: Array) -> list[Array]:
         column = open_columns.pop(int(at))
         rows[[i, i + int(pivot)]] = rows[[i + int(pivot), i]]
         rows[i] /= rows[i, column]
-        for k in range(len(rows)):
-            if k != i:
-                rows[k] -= rows[k, column] * rows[i]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
     return [row / np.linalg.norm(row) for row in rows]
 
 
