@@ -80,7 +80,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
     result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    lines = [line for own in recordings for line in import_recording.recording_issue_lines(own, " --replace") if line]
+    lines = [line for r in recordings for line in import_recording.recording_issue_lines(r, " --replace")[0] if line]
     lines += _summary_lines(proposal, out, recordings, result["picture"] is not None)
     end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
     print_result(arguments, result, lambda: lines, end, str(out))
