@@ -169,12 +169,12 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     lost = {key: own for key, own in moving.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
-    said = uncertainty.goodness_of_fit_message(fit)
     is_coarse = any("First set " in note for note in result.get("discretisation_notes", ()))
+    said = uncertainty.goodness_of_fit_message(fit, with_advice=fit["data_trusted"] and not is_coarse)
     if is_coarse:
-        said = f"{said.partition(' To find')[0]} First make the model finer, as follows."
+        said += " First make the model finer, as follows."
     elif not fit["data_trusted"]:
-        said = f"{said.partition(' To find')[0]} First follow the advice on the issues."
+        said += " First follow the advice on the issues."
     elif near:
         said += f" Also check size and unit of the start values of {names}: near them the recordings hardly depend on "
         said += "them, so the fit could not correct a wrong one."
