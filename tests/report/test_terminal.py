@@ -217,6 +217,9 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `gauss_newton (best)`: all methods agree within their ± on the parameters that are"
+    halves = {"gauss_newton": solved(), "late": solved(status="stopped"), "short": solved(status="iteration_limit")}
+    ends = line_of(told("yid-compare/1", compared(methods=halves)), "status").split()[1:]
+    assert ends == ["converged", "time", "limit", "iteration", "limit"]
     lines = told("yid-compare/1", compared())
     assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (said, True)
 
@@ -225,7 +228,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted; that is said first."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
-    methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
+    methods = {"single_shooting": doubtful, "late": doubtful | {"status": "stopped", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("Do not use the columns single_shooting, because these methods ignore noise")
     assert line_of(lines, "parameter").split()[2:5] == ["best", "fit", "unit"], "a method without a value has no column"

@@ -194,7 +194,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "additional noise of the joint angles (sensors.joints.position.std)"
-    quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
+    quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit", "stopped")
     found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
         tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
