@@ -195,6 +195,11 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
+    arm = {"a": {"encoder_noise": 0.5, "std": 0.1}}
+    cutoff = {"discretisation": arm, "finer_settings": {"encoder_noise": "problem.path_cutoff: 4"}}
+    text = " ".join(told("yid-solve/1", solved(**cutoff)))
+    assert "set problem.path_cutoff: 4 (at least the highest frequency of the arm), and solve again." in text
+    assert "--set problem.path_cutoff=4 " in text, "the command has the value alone"
     rest = "Checked: half the time step would change no estimate by more than its ±."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "For a smaller ±, set model.object.links: 8, and solve again."

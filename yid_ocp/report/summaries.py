@@ -106,7 +106,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from _held_out_blocks(result)
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
-    yield from discretisation_shift_sentences(result)
+    yield from discretisation_shift_sentences(result)[0]
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
@@ -122,8 +122,8 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
         asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
         return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
     lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
-    told = " ".join((*result.get("discretisation_notes", ()), *discretisation_shift_sentences(result)))
-    finer = [text for text in result.get("finer_settings", {}).values() if text in told]
+    notes, cures = " ".join(result.get("discretisation_notes", ())), discretisation_shift_sentences(result)[1]
+    finer = [text for text in result.get("finer_settings", {}).values() if text in cures or f"set {text}," in notes]
     options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
