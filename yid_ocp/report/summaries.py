@@ -380,7 +380,7 @@ def _change_text(name: str, direction: Mapping[str, Any], entry: Mapping[str, An
 
 @SUMMARIES.register("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
+    message, is_usable = result["message"], result["goal"] == "information" or result["unfinished"]
     done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
     said = f"{'Not finished' if is_usable else 'Do not use this motion'}: {message}."
     said = done if result["status"] == "done" else said
@@ -403,7 +403,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = {} if result["from"]["run"] or is_hopeless else steps
     steps |= record if result["goal"] == "information" else {}
-    yield next_steps_table(result, longer if not is_usable and said != done else steps)
+    yield next_steps_table(result, longer if not is_usable and result["status"] != "done" else steps)
 
 
 def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
