@@ -260,6 +260,18 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
         assert ("[FILE]' --set sensors.points.used_points=null" in said) == is_used
 
 
+def test_what_is_hidden_is_told_by_its_cause():
+    alone = {"verdict": "not_identifiable", "std_relative": 9.0, "components": {"a": 1.0}, "words": "W"}
+    alone |= {"unobserved_parameter": "", "hidden_change": "", "hidden_by": ""}
+    changes = [alone | {"hidden_change": f"a change of {name}", "hidden_by": "a start"} for name in "bc"]
+    found = [alone | {"unobserved_parameter": "a"}, *changes, alone]
+    parameters = {name: judged("not_identifiable") for name in "abc"}
+    lines = told("yid-identifiability/1", information(parameters=parameters, directions=found))
+    at = lines.index("No sensor observes a.")
+    said = "These recordings cannot distinguish a change of b, or a change of c from a start."
+    assert lines[at + 1 : at + 3] == [said, "W."]
+
+
 def test_a_simulation_that_failed_and_one_that_did_not():
     done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5, "message": "It is short."}
     failed, good = (told("yid-simulate/1", own)[0] for own in ({"status": "failed", "message": "step 3"}, done))

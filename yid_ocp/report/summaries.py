@@ -293,15 +293,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         allowed.append(f"grasps that are displaced by {1e3 * std:g} mm (one standard deviation)")
     yield SummaryStatement(f"The ± and verdicts allow for {' and '.join(allowed)}." if allowed else "", "verdict")
     yield from issue_summary_blocks(result)
-    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
-    unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
+    hidden = [own for own in result["directions"] if own["verdict"] == "not_identifiable"]
+    unobserved = {own["unobserved_parameter"] for own in hidden}
+    unseen = [name for name in parameters if name in unobserved]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
-    hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    shown = (words.removeprefix("these recordings cannot distinguish ") for words in hidden[:_MAX_DIRECTIONS])
-    parts = (words.partition(" from ") for words in shown)
-    for cause, own in grouped((cause or change, change) for change, _, cause in parts).items():
-        said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
-        yield said if own != [cause] else f"{cause}."
+    hidden = [own for own in hidden if not own["unobserved_parameter"]]  # the table has those of one parameter
+    for cause, alike in grouped((own["hidden_by"] or own["words"], own) for own in hidden[:_MAX_DIRECTIONS]).items():
+        changes = ", or ".join(own["hidden_change"] for own in alike)
+        yield f"These recordings cannot distinguish {changes} from {cause}." if changes else f"{cause}."
     yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
     loose = [(own, names[:_MAX_CHANGES]) for own, names in together if own["verdict"] == "weak"]
@@ -333,7 +332,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             why = f"estimate from FILE, a recording with {best['words']}"
             steps[why] = f"solve --set 'recordings.estimate=[FILE]'{options}"
         # servos cannot follow a planned motion exactly, and springs in series need more markers
-        elif not result.get("has_servos") and not any("springs in series" in text for text in hidden):
+        elif not result.get("has_servos") and not any("springs in series" in own["words"] for own in hidden):
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         for _, names in sorted(together, key=lambda pair: pair[0]["verdict"] != "weak")[:1]:  # a text asks to fix it
             options = f"--set parameters.{names[0]}.free=false --set parameters.{names[0]}.initial=VALUE"
@@ -455,8 +454,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"The motion reaches {text}."
     for words, unobserved in grouped((words, name) for name, words in result["unseen"].items()).items():
         yield f"No motion that was tried lets a sensor observe {', '.join(unobserved)}. For this, {words}."
-    unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (f"This motion leaves open: {words}." for words in result["open"] if not words.startswith(unseen))
+    yield from (f"This motion leaves open: {words}." for words in result["open"])
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 
