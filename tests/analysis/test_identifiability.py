@@ -146,6 +146,7 @@ def test_what_only_nuisances_hide_is_said_to_be_hidden_by_them(monkeypatch, nuis
     [hidden] = identifiability(Formula(lambda x: [30 * (x["a"] / 2 - 1)], {"a": 2.0})).directions
     assert hidden.verdict == "not_identifiable"
     assert hidden.words.startswith(f"these recordings cannot distinguish a change of a from {words}. ")
+    assert (hidden.hidden_change, hidden.hidden_by.startswith(f"{words}. ")) == ("a change of a", True)
 
 
 def test_a_combination_that_a_nuisance_hides_is_said_so():
@@ -223,6 +224,7 @@ def test_what_is_hardly_seen_is_said_not_to_be_seen(size, words):
     """Fewer standard deviations than a quarter for a change by the whole value."""
     [first, _] = identifiability(Formula(two(30.0, size), START)).directions
     assert (first.words, first.singular_value) == (words, pytest.approx(size))
+    assert first.unobserved_parameter == ("b" if "no sensor" in words else "")
 
 
 def test_what_is_said_of_one_parameter_is_what_stands_beside_it():

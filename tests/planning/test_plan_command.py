@@ -119,7 +119,11 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
 
 
 def test_a_plan_that_fails_says_so(config, carried_out):
+    """A search that its limit of evaluations ends is not finished; one that finds its best motion is no use."""
+    best = carried_out("plan", config, settings=["plan.duration=0.05"], codes=(1,), out="best")
+    assert (best.result["unfinished"], best.out.startswith("Do not use this motion: ")) == (False, True)
     done = carried_out("plan", config, settings=["plan.duration=0.1"], codes=(1,))
+    assert (done.result["unfinished"], done.out.startswith("Not finished: ")) == (True, True)
     assert done.result["status"] == "failed"
     assert done.result["message"] in done.out
     assert done.result["message"] in html.unescape((done.folder / "report.html").read_text())

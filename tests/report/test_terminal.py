@@ -195,6 +195,11 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
+    arm = {"a": {"encoder_noise": 0.5, "std": 0.1}}
+    cutoff = {"discretisation": arm, "finer_settings": {"encoder_noise": "problem.path_cutoff: 4"}}
+    text = " ".join(told("yid-solve/1", solved(**cutoff)))
+    assert "set problem.path_cutoff: 4 (at least the highest frequency of the arm), and solve again." in text
+    assert "--set problem.path_cutoff=4 " in text, "the command has the value alone"
     rest = "Checked: half the time step would change no estimate by more than its ±."
     assert lines.index("it snaps") < (at := lines.index(said))
     cure = "For a smaller ±, set model.object.links: 8, and solve again."
@@ -217,6 +222,9 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
     said = "Use the column `gauss_newton (best)`: all methods agree within their ± on the parameters that are"
+    halves = {"gauss_newton": solved(), "late": solved(status="stopped"), "short": solved(status="iteration_limit")}
+    ends = line_of(told("yid-compare/1", compared(methods=halves)), "status").split()[1:]
+    assert ends == ["converged", "time", "limit", "iteration", "limit"]
     lines = told("yid-compare/1", compared())
     assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (said, True)
 
@@ -225,7 +233,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted; that is said first."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
-    methods = {"single_shooting": doubtful, "late": doubtful | {"status": "iteration_limit", "iterations": 0}}
+    methods = {"single_shooting": doubtful, "late": doubtful | {"status": "stopped", "iterations": 0}}
     lines = told("yid-compare/1", compared(methods=methods, judged=sure, disturbed=True))
     assert lines[0].startswith("Do not use the columns single_shooting, because these methods ignore noise")
     assert line_of(lines, "parameter").split()[2:5] == ["best", "fit", "unit"], "a method without a value has no column"
@@ -233,7 +241,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():
-    base = {"words": "none (the experiment as it is)", "identifiable": 0, "gain": None, "message": ""}
+    base = {"words": "none (the experiment as it is)", "identifiable": 0, "gain": None, "message": "", "changes": []}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
     lines = told("yid-identifiability/1", result)
@@ -245,6 +253,23 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     at = lines.index("estimate from FILE, a recording with a weld:")
     assert lines[at + 1].endswith("'recordings.estimate=[FILE]'")
     assert not any(line.startswith("plan a motion") for line in lines), "a plan may not suffice"
+    for change, is_used in (("camera:tip", True), ("rate:30", False)):
+        best = base | {"words": "a point, seen well", "changes": [change]}
+        more = {"what_if": asked | {"smallest": [best]}, "groups_with_chosen_points": ["points"]}
+        said = " ".join(told("yid-identifiability/1", result | more))
+        assert ("[FILE]' --set sensors.points.used_points=null" in said) == is_used
+
+
+def test_what_is_hidden_is_told_by_its_cause():
+    alone = {"verdict": "not_identifiable", "std_relative": 9.0, "components": {"a": 1.0}, "words": "W"}
+    alone |= {"unobserved_parameter": "", "hidden_change": "", "hidden_by": ""}
+    changes = [alone | {"hidden_change": f"a change of {name}", "hidden_by": "a start"} for name in "bc"]
+    found = [alone | {"unobserved_parameter": "a"}, *changes, alone]
+    parameters = {name: judged("not_identifiable") for name in "abc"}
+    lines = told("yid-identifiability/1", information(parameters=parameters, directions=found))
+    at = lines.index("No sensor observes a.")
+    said = "These recordings cannot distinguish a change of b, or a change of c from a start."
+    assert lines[at + 1 : at + 3] == [said, "W."]
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():

@@ -38,7 +38,7 @@ class _MethodResult:
     @property
     def has_values(self) -> bool:
         """False if the method was stopped at its start, which is no result."""
-        return self.solution.status != Status.ITERATION_LIMIT or len(self.solution.history) != 1
+        return self.solution.status != Status.STOPPED or len(self.solution.history) != 1
 
 
 @dataclass(frozen=True)

@@ -342,11 +342,10 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
 
 def finer_setting_texts(problem: EstimationProblem) -> dict[str, str]:
     """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise."""
-    options, divided = problem.options, problem.options.divided_links_model
+    divided = problem.options.divided_links_model
     found = {"links": divided.setting_text} if divided is not None and divided.setting_text else {}
     found["time_step"] = f"problem.time_step: {problem.step.time_step / 2:g}"
-    cutoff = f"problem.path_cutoff: {options.path_cutoff / 2:g} (at least the highest frequency of the arm)"
-    return found | {"encoder_noise": cutoff if options.path_cutoff else ""}
+    return found | {"encoder_noise": f"problem.path_cutoff: {problem.options.path_cutoff / 2:g}"}
 
 
 def parameter_shifts_at_finer_discretisation(

@@ -72,6 +72,9 @@ class _ParameterDirection:
     components: Mapping[str, float]  # relative change by parameter, together of unit length
     verdict: str
     words: str  # sentence on what the recordings determine along it
+    unobserved_parameter: str = ""  # the parameter along it, if no sensor observes it
+    hidden_change: str = ""  # in words, if other unknowns imitate it
+    hidden_by: str = ""  # these unknowns, with advice
 
 
 @dataclass(frozen=True, repr=False)
@@ -309,8 +312,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
     """Return parameters and combinations without information, and informed directions, sorted by their information."""
     relative, count = view.relative, len(view.names)
     hidden = view.alone * uncertainty.MAX_WEAK_RELATIVE_STD < 1.0
-    unseen = ((np.eye(count)[i], f"{view.names[i]} is observed by no sensor") for i in np.flatnonzero(hidden))
-    found = [_direction(view, *own) for own in unseen]
+    found = [_unseen_direction(view, vector) for vector in np.eye(count)[hidden]]
     rest = np.flatnonzero(~hidden)
     if len(rest):
         _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
@@ -321,7 +323,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
             # an orthonormal basis of the complement of the observable directions
             seen, left = wide[~blind][:, rest], np.zeros((int(blind.sum()), count))
             left[:, rest] = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : len(left)].T
-            found += [_direction(view, vector, _unseen_words(view, vector)) for vector in _sparse_basis(left)]
+            found += [_unseen_direction(view, vector) for vector in _sparse_basis(left)]
         for size, vector in zip(sizes[~blind], wide[~blind], strict=True):
             found.append(_direction(view, vector, _seen_words(view, float(size), vector, std)))
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
@@ -343,9 +345,8 @@ def _sparse_basis(vectors: Array) -> list[Array]:
         column = open_columns.pop(int(at))
         rows[[i, i + int(pivot)]] = rows[[i + int(pivot), i]]
         rows[i] /= rows[i, column]
-        for k in range(len(rows)):
-            if k != i:
-                rows[k] -= rows[k, column] * rows[i]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
     return [row / np.linalg.norm(row) for row in rows]
 
 
@@ -374,13 +375,19 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
     return [_Component(*part) for part in parts if abs(part[1]) > 0.05 * np.max(np.abs(vector))]
 
 
-def _unseen_words(view: _Sensitivities, vector: Array) -> str:
+def _unseen_direction(view: _Sensitivities, vector: Array) -> _ParameterDirection:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
         change = ("a change of " if len(parts) == 1 else "") + _change_words(parts)
-        return f"these recordings cannot distinguish {change} from {_hiding_nuisances(view, vector)}"
+        cause = _hiding_nuisances(view, vector)
+        made = _direction(view, vector, f"these recordings cannot distinguish {change} from {cause}")
+        return replace(made, hidden_change=change, hidden_by=cause)
+    if len(parts) == 1:
+        name = parts[0].name
+        return replace(_direction(view, vector, f"{name} is observed by no sensor"), unobserved_parameter=name)
     said = _combination(view, *parts) if len(parts) == 2 and all(part.value > 0 for part in parts) else None
-    return _combination_words(parts) if said is None else f"{_joined([p.name for p in parts])} are determined {said}"
+    words = _combination_words(parts) if said is None else f"{_joined([p.name for p in parts])} are determined {said}"
+    return _direction(view, vector, words)
 
 
 def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
@@ -429,8 +436,6 @@ def _change_words(parts: Sequence[_Component]) -> str:
 
 def _combination_words(parts: Sequence[_Component]) -> str:
     """Return a sentence on the combined change of parameters along an unidentifiable direction."""
-    if len(parts) == 1:
-        return f"{parts[0].name} is observed by no sensor"
     order = sorted(parts, key=lambda part: -abs(part.coefficient))
     sizes = ((part.name, 10 * part.coefficient / abs(order[0].coefficient)) for part in order[:_MAX_LISTED_NAMES])
     trade = " with ".join(f"{name} {size:+.2g} %" for name, size in sizes)

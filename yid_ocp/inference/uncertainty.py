@@ -477,8 +477,8 @@ VERDICT_TABLE_TEXTS: Mapping[str, str] = {
 """Words for each verdict of a parameter."""
 
 
-def goodness_of_fit_message(fit: Mapping[str, Any]) -> str:
-    """Return a sentence that states whether a model explains its recordings, with advice for a poor fit.
+def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) -> str:
+    """Return a sentence that states whether a model explains its recordings. `with_advice`: what to do if it does not.
 
     `fit` has the attributes of a `GoodnessOfFit`; `p_value` and `noise_fraction` may be missing.
     A fit with more error than noise alone usually leaves is not called within noise, even if it is not significant.
@@ -499,7 +499,7 @@ def goodness_of_fit_message(fit: Mapping[str, Any]) -> str:
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
     what = "units, signs, names and noise" if chi2_per_dof * fraction**2 > HOPELESS_CHI2 else "the stated noise"
-    return f"{said} To find the cause, check {what} and run `yid-ocp diagnose`."
+    return f"{said} To find the cause, check {what} and run `yid-ocp diagnose`." if with_advice else said
 
 
 def overstated_noise_sentence(chi2_per_dof: float, p_value: float | None) -> str:

@@ -58,7 +58,7 @@ class InformativeMotionPlan(PlannedMotion):
     best_start_index: int
     active_limits: Mapping[str, tuple[str, ...]]  # joints, springs or frames that reach a limit, by kind of limit
     unobservable_parameters: Mapping[str, str]  # parameters that no motion informs, each with a measurement that would
-    unidentifiable_directions: tuple[str, ...]  # sentences on what the planned recording would leave unidentifiable
+    unidentifiable_directions: tuple[str, ...]  # sentences on what else the planned recording leaves unidentifiable
 
 
 def plan_informative_motion(
@@ -302,7 +302,7 @@ def _plan(
         best_start_index=best,
         active_limits=_active(search, limits, w),
         unobservable_parameters=lost,
-        unidentifiable_directions=unidentifiable,
+        unidentifiable_directions=tuple(words for words, name in unidentifiable.items() if name not in lost),
     )
 
 
@@ -314,8 +314,8 @@ def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion
     return criterion.value_and_gradient_wrt_sensitivities(rows)[0]
 
 
-def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:
-    """Parameter precisions from the recordings, the plan and both, and the directions left unidentifiable."""
+def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], dict[str, str]]:
+    """Parameter precisions by recordings, plan and both; directions left open, with what no sensor observes."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
     planned = experiment.problem_with_planned_recording_only(w)
@@ -330,7 +330,7 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
         first, last = before.parameters[name].std_relative, after.parameters[name].std_relative
         least = min(first, last, float(std) if std < MAX_WEAK_RELATIVE_STD else math.inf)
         found[name] = _ParameterPrecision(first, last, least, after.parameters[name].verdict)
-    return found, tuple(entry.words for entry in after.unidentifiable_directions)
+    return found, {entry.words: entry.unobserved_parameter for entry in after.unidentifiable_directions}
 
 
 def _distances(

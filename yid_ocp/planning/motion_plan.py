@@ -55,6 +55,7 @@ class TargetMotionPlan(PlannedMotion):
     max_path_deviation: float | None  # largest distance from the reference path [m]; None without one
     end_position_std: Array | None  # (3,), of the final position, from the parameters' covariance [m]; None without one
     n_evaluations: int  # motions that the search simulated with derivatives
+    is_unfinished: bool  # whether the search ended at plan.max_iterations, with a motion within the limits
 
 
 def plan_motion_to_target(
@@ -274,7 +275,7 @@ def _outcome(
         message += f"({1e3 * most:.3g} mm, {TARGET_REACHED_TOLERANCE_FACTOR:g} times tolerance or std, is tolerated). "
         message += "Set a longer plan.duration or a nearer target"
     reached = shot.is_converged and not broken and not far
-    errors = error, swing, off_path, std, shot.n_evaluations
+    errors = error, swing, off_path, std, shot.n_evaluations, shot.is_unfinished
     point = rows.point.names[0]
     return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.target, *errors, target_point=point)
 

@@ -180,10 +180,11 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class MotionToTargetResult:
-    """The coefficients w (K, nc) of a planned motion, and whether the search converged within the limits."""
+    """The coefficients w (K, nc) of a planned motion, and how the search for it ended."""
 
     w: Array
     is_converged: bool
+    is_unfinished: bool  # whether the search ended at its limit of evaluations, with a motion within the limits
     message: str
     n_evaluations: int
 
@@ -233,10 +234,10 @@ class MotionToTargetSearch:
             before = passed
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
-        if not ended and not passed > _LIMIT_TOLERANCE:
+        if is_unfinished := not ended and not passed > _LIMIT_TOLERANCE:
             message = f"plan.max_iterations ended the search ({iterations} evaluations). Raise it or use this motion"
         evaluations = self._residual_and_limit_values.cache_info().misses
-        return MotionToTargetResult(x.reshape(self._shape), finished, message, evaluations)
+        return MotionToTargetResult(x.reshape(self._shape), finished, is_unfinished, message, evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""

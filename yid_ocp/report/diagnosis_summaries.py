@@ -321,7 +321,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str
 @SUMMARIES.register("yid-compare/1")
 def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known, judged = result["methods"], result["judged"]
-    stopped = [m for m, e in known.items() if e["status"] == "iteration_limit" and not e["iterations"]]  # no values
+    stopped = [m for m, e in known.items() if e["status"] == "stopped" and not e["iterations"]]  # no values
     methods = {method: entry for method, entry in known.items() if method not in stopped}
     if not methods and not result["disturbed"]:
         yield SummaryStatement("No method ended an iteration. Raise compare.total_time_budget.", "conclusion")
@@ -386,8 +386,7 @@ def _objections_to_agreement(result: Mapping[str, Any], methods: Iterable[str], 
 def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     entries = methods.values()
     yield "quantity", *methods
-    by_time = "compare.total_time_budget"  # named by the message of what the time stopped
-    yield "status", *("time limit" if by_time in e["message"] else e["status"].replace("_", " ") for e in entries)
+    yield "status", *("time limit" if e["status"] == "stopped" else e["status"].replace("_", " ") for e in entries)
     costs = ("failed" if (x := entry["whitened_cost"]) is None else f"{x:.6g}" for entry in entries)
     yield "cost (half the sum of (error/noise)^2)", *costs
     chi2 = "chi2 per degree of freedom (noise alone: 1)"

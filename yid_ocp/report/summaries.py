@@ -106,7 +106,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from _held_out_blocks(result)
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
-    yield from discretisation_shift_sentences(result)
+    yield from discretisation_shift_sentences(result)[0]
     yield "" if failed else SummaryStatement(unused_efforts_sentence(result), "verdict")
     yield from copyable_estimates_blocks(result) if converged else ()
     yield result.get("safeguard", "")
@@ -122,8 +122,8 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
         asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
         return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
     lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
-    told = " ".join((*result.get("discretisation_notes", ()), *discretisation_shift_sentences(result)))
-    finer = [text for text in result.get("finer_settings", {}).values() if text in told]
+    notes, cures = " ".join(result.get("discretisation_notes", ())), discretisation_shift_sentences(result)[1]
+    finer = [text for text in result.get("finer_settings", {}).values() if text in cures or f"set {text}," in notes]
     options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
     steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
@@ -293,15 +293,14 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         allowed.append(f"grasps that are displaced by {1e3 * std:g} mm (one standard deviation)")
     yield SummaryStatement(f"The ± and verdicts allow for {' and '.join(allowed)}." if allowed else "", "verdict")
     yield from issue_summary_blocks(result)
-    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] == "not_identifiable"]
-    unseen = [name for name in parameters if f"{name} is observed by no sensor" in hidden]
+    hidden = [own for own in result["directions"] if own["verdict"] == "not_identifiable"]
+    unobserved = {own["unobserved_parameter"] for own in hidden}
+    unseen = [name for name in parameters if name in unobserved]
     yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
-    hidden = [w for w in hidden if w.partition(" is ")[0] not in parameters]  # the table has those of one parameter
-    shown = (words.removeprefix("these recordings cannot distinguish ") for words in hidden[:_MAX_DIRECTIONS])
-    parts = (words.partition(" from ") for words in shown)
-    for cause, own in grouped((cause or change, change) for change, _, cause in parts).items():
-        said = f"These recordings cannot distinguish {', or '.join(own)} from {cause}."
-        yield said if own != [cause] else f"{cause}."
+    hidden = [own for own in hidden if not own["unobserved_parameter"]]  # the table has those of one parameter
+    for cause, alike in grouped((own["hidden_by"] or own["words"], own) for own in hidden[:_MAX_DIRECTIONS]).items():
+        changes = ", or ".join(own["hidden_change"] for own in alike)
+        yield f"These recordings cannot distinguish {changes} from {cause}." if changes else f"{cause}."
     yield SummaryTable(rows, "Parameters (± is one standard deviation)", is_key_table=True)
     is_poor = result["fit"] is not None and not result["fit"]["explains"]
     loose = [(own, names[:_MAX_CHANGES]) for own, names in together if own["verdict"] == "weak"]
@@ -318,27 +317,27 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
-    steps = {"fit, for estimates with intervals": "identifiability"} if is_initial and (found or weak) else {}
+    flags = " --unknown-grasp" * (result.get("grasp_std") is not None)
+    flags += " --unknown-start" * (result.get("start") == "unknown")
+    steps = {"fit, for estimates with intervals": f"identifiability{flags}"} if is_initial and (found or weak) else {}
     steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
-    more = {"compute exact intervals, which may be asymmetric": "identifiability --intervals all"}
+    more = {"compute exact intervals, which may be asymmetric": f"identifiability --intervals all{flags}"}
     steps |= {} if is_initial or result["profiles"] else more
     if weak or lost:
         if asked and asked["smallest"]:
-            words = asked["smallest"][0]["words"]
-            points = result.get("groups_with_chosen_points", ()) if "seen by" in words else ()
+            best = asked["smallest"][0]
+            has_new_points = any(change.partition(":")[0] in ("camera", "arm") for change in best["changes"])
+            points = result.get("groups_with_chosen_points", ()) if has_new_points else ()
             options = "".join(f" --set sensors.{group}.used_points=null" for group in points)
-            why = f"estimate from FILE, a recording with {words}"
+            why = f"estimate from FILE, a recording with {best['words']}"
             steps[why] = f"solve --set 'recordings.estimate=[FILE]'{options}"
         # servos cannot follow a planned motion exactly, and springs in series need more markers
-        elif not result.get("has_servos") and not any("springs in series" in text for text in hidden):
+        elif not result.get("has_servos") and not any("springs in series" in own["words"] for own in hidden):
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         for _, names in sorted(together, key=lambda pair: pair[0]["verdict"] != "weak")[:1]:  # a text asks to fix it
             options = f"--set parameters.{names[0]}.free=false --set parameters.{names[0]}.initial=VALUE"
             steps["fix a parameter whose VALUE is known"] = f"solve {options}"
-        steps |= {} if asked else {"rank other experiments (takes minutes)": "identifiability --what-if"}
-    allowed_for = " --unknown-grasp" * (result.get("grasp_std") is not None)
-    allowed_for += " --unknown-start" * (result.get("start") == "unknown")
-    steps = {why: text + allowed_for * text.startswith("identifiability") for why, text in steps.items()}
+        steps |= {} if asked else {"rank other experiments (takes minutes)": f"identifiability --what-if{flags}"}
     yield next_steps_table(result, steps)
 
 
@@ -380,7 +379,7 @@ def _change_text(name: str, direction: Mapping[str, Any], entry: Mapping[str, An
 
 @SUMMARIES.register("yid-plan/1")
 def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    message, is_usable = result["message"], result["goal"] == "information" or "max_iter" in result["message"]
+    message, is_usable = result["message"], result["goal"] == "information" or result["unfinished"]
     done = f"{message[0].upper()}{message[1:]}. trajectory.json has it for the robot."
     said = f"{'Not finished' if is_usable else 'Do not use this motion'}: {message}."
     said = done if result["status"] == "done" else said
@@ -403,7 +402,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = {} if result["from"]["run"] or is_hopeless else steps
     steps |= record if result["goal"] == "information" else {}
-    yield next_steps_table(result, longer if not is_usable and said != done else steps)
+    yield next_steps_table(result, longer if not is_usable and result["status"] != "done" else steps)
 
 
 def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -455,8 +454,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield f"The motion reaches {text}."
     for words, unobserved in grouped((words, name) for name, words in result["unseen"].items()).items():
         yield f"No motion that was tried lets a sensor observe {', '.join(unobserved)}. For this, {words}."
-    unseen = tuple(f"{name} is" for name in result["unseen"])
-    yield from (f"This motion leaves open: {words}." for words in result["open"] if not words.startswith(unseen))
+    yield from (f"This motion leaves open: {words}." for words in result["open"])
     yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
 
 

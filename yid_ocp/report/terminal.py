@@ -169,12 +169,12 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     lost = {key: own for key, own in moving.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
-    said = uncertainty.goodness_of_fit_message(fit)
     is_coarse = any("First set " in note for note in result.get("discretisation_notes", ()))
+    said = uncertainty.goodness_of_fit_message(fit, with_advice=fit["data_trusted"] and not is_coarse)
     if is_coarse:
-        said = f"{said.partition(' To find')[0]} First make the model finer, as follows."
+        said += " First make the model finer, as follows."
     elif not fit["data_trusted"]:
-        said = f"{said.partition(' To find')[0]} First follow the advice on the issues."
+        said += " First follow the advice on the issues."
     elif near:
         said += f" Also check size and unit of the start values of {names}: near them the recordings hardly depend on "
         said += "them, so the fit could not correct a wrong one."
@@ -188,13 +188,13 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
         yield SummaryStatement(said if rough else "", "conclusion")
 
 
-def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
-    """Return sentences on finer discretisations of a fit that ended: which shift estimates by more than noise."""
-    said, cures = [], list[str]()
+def discretisation_shift_sentences(result: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Return sentences on which finer discretisations of a fit shift estimates beyond noise, and their settings."""
+    said, cures, settings = [], list[str](), result.get("finer_settings", {})
     units = {name: f" {own['unit']}".removesuffix(" 1") for name, own in result["parameters"].items()}
     kinds = {"links": "twice the links", "time_step": "half the time step"}
     kinds["encoder_noise"] = "additional noise of the joint angles (sensors.joints.position.std)"
-    quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit")
+    quiet, has_ended = list[str](), result.get("status") not in ("stalled", "iteration_limit", "stopped")
     found = result.get("discretisation", {}) if has_ended else {}
     for key, words in kinds.items():
         tried = {name: own for name, own in found.items() if own.get(key) is not None and own["std"] is not None}
@@ -202,14 +202,15 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
         if moved:
             worst = max(moved, key=moved.__getitem__)
             change = f"most of all {worst} (by {tried[worst][key]:+.2g}{units.get(worst, '')}). The ± includes this."
-            cures += [own] if (own := result.get("finer_settings", {}).get(key)) else []
+            cures += [settings[key]] if settings.get(key) else []
             many = count_with_noun(len(moved), "estimate")
             said.append(f"{words.capitalize()} would change {many} by more than noise, {change}")
         elif tried:
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
         said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
-    return said + ([f"For a smaller ±, set {' and '.join(cures)}, and solve again."] if cures else [])
+    remark = " (at least the highest frequency of the arm)" * (settings.get("encoder_noise") in cures)
+    return said + ([f"For a smaller ±, set {' and '.join(cures)}{remark}, and solve again."] if cures else []), cures
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:

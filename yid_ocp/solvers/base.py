@@ -50,6 +50,7 @@ class Status(str, Enum):
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "iteration_limit"
+    STOPPED = "stopped"  # by a callback, such as one with a time limit
     STALLED = "stalled"
     FAILED = "failed"
 
@@ -455,7 +456,7 @@ def _minimize_cost(
         return solver.minimize_cost(problem, x, watched)
     except StopSearch as stop:
         last = seen[-1]
-        found = (Status.ITERATION_LIMIT, str(stop), last.x, tuple(seen), last.n_evaluations)
+        found = (Status.STOPPED, str(stop), last.x, tuple(seen), last.n_evaluations)
         return SolverResult(*found, stopped_by_callback=True)
 
 

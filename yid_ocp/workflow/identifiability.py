@@ -152,8 +152,7 @@ def _identifiability_result(
         "format": "yid-identifiability/1",
         "status": "not_solved" if solution is None else solution.status.value,
         "message": "judged at the initial values" if solution is None else solution.message,
-        "at": asked.evaluation_point,
-        "start": asked.start_knowledge,
+        **attributes_to_dict(asked, "at=evaluation_point start=start_knowledge"),
         "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
         "issues": issues_to_plain_data(problem.options.data_issues),
@@ -185,8 +184,7 @@ def _identifiability_result(
         "nuisances": len(information.nuisance_names),
         "profiles": {
             name: {
-                "values": own.values,
-                "delta_chi2": own.delta_chi2,
+                **attributes_to_dict(own, "values delta_chi2"),
                 "notes": [t for t in (*own.notes, own.better_fit) if t],
             }
             for name, own in information.profiles.items()

@@ -42,12 +42,12 @@ _SWITCHES = {("has_header", False): "--no-header", ("skip_bad_lines", True): "--
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     """Run the command `import` and return its exit code."""
-    files, asked = arguments.files, reader_options_from_arguments(arguments)
+    files, out, asked = arguments.files, arguments.out, reader_options_from_arguments(arguments)
     if arguments.preview:
         return _preview(arguments, asked)
-    if arguments.out is None or not has_native_recording_suffix(arguments.out):
-        name, where = arguments.out or Path(files[0]).name, "--out"
-        what = "the option --out is missing" if arguments.out is None else f"'{name}' does not end in .h5"
+    if out is None or not has_native_recording_suffix(out):
+        name, where = out or Path(files[0]).name, "--out"
+        what = "the option --out is missing" if out is None else f"'{name}' does not end in .h5"
         hint = f"write --out {Path(name).with_suffix('.h5')}"
         raise ConfigError(what, where=where, allowed="NAME.h5, or --preview", hint=hint)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
@@ -55,13 +55,13 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         options = {name: value for name, value in said.items() if value is not None} | asked
         recording = _read(files, options, progress)
-        recording = replace(recording, name=Path(arguments.out).stem) if len(files) > 1 else recording
-        replaced = [f"note: {arguments.out} existed and was replaced"] if Path(arguments.out).exists() else []
-        write_recording(recording, arguments.out)
-    out, issues = arguments.out, recording_issue_lines(recording)
+        recording = replace(recording, name=Path(out).stem) if len(files) > 1 else recording
+        replaced = [f"note: {out} existed and was replaced"] if Path(out).exists() else []
+        write_recording(recording, out)
+    issues, is_severe = recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
     then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, or list it in CONFIG.yaml: recordings.estimate"
-    if any(line.startswith("issue") for line in issues):
+    if is_severe:
         then = f"{out} has the values as read: do not use it before the advice above is followed"
     lines = [*issues, *recording_summary_lines(recording), "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
@@ -122,11 +122,11 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"
-    return ["", *recording_issue_lines(recording), f"to import {what}:", f"  {_import_command_line(files, options)}"]
+    return ["", *recording_issue_lines(recording)[0], f"to import {what}:", f"  {_import_command_line(files, options)}"]
 
 
-def recording_issue_lines(recording: Recording, more_flags: str = "") -> list[str]:
-    """Return lines about the issues of a recording that show without a model. Lines on severe ones begin with issue."""
+def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[list[str], bool]:
+    """Return lines about the issues of a recording that show without a model, and whether one of them is severe."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -134,7 +134,8 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> list[st
     said = [f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n  try: {own.advice}" for own in found]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
-    return [*said, ""] if said else []
+    is_severe = bool(units) or any(own.severity != "warning" for own in found)
+    return [*said, ""] if said else [], is_severe
 
 
 def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) -> Recording:

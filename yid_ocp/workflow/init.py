@@ -80,7 +80,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
     result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    lines = [line for own in recordings for line in import_recording.recording_issue_lines(own, " --replace") if line]
+    lines = [line for r in recordings for line in import_recording.recording_issue_lines(r, " --replace")[0] if line]
     lines += _summary_lines(proposal, out, recordings, result["picture"] is not None)
     end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
     print_result(arguments, result, lambda: lines, end, str(out))
@@ -366,28 +366,28 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], str, Sequence[Any]]]:
     """Yield every sensor group with its settings as YAML, their reason, and the places of its points."""
     for group, noise in proposal.noise_by_group.items():
-        places, entries, said = proposal.point_placements.get(group, ()), [], f"noise {noise.reason}"
+        places, entries, unused = proposal.point_placements.get(group, ()), list[str](), ""
+        said = f"noise {noise.reason}"
         if noise.std is not None:
             size = "each joint" if isinstance(noise.std, Mapping) else f"{noise.std:.2g} {noise.unit}"
             entries, said = [f"std: {_number_or_numbers_by_name(noise.std)}"], f"noise of {size}, {noise.reason}"
         elsewhere = (place for place in places if place.model_frame not in ("", place.point))
         if frames := {place.point: place.frame for place in elsewhere}:
             entries.append(f"frame_by_recorded_name: {_value(frames)}")
-        told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
         if group == "joints.effort":
             if proposal.torque_bias_std and not proposal.is_identified_from_efforts_only:
                 entries.append(f"bias_std: {_number_or_numbers_by_name(proposal.torque_bias_std)}")
                 said += ". bias_std is the expected constant error of a torque (a guess: 1 % of its limit in the robot "
                 said += "file, else 5 % of the largest recorded one)"
-            if told_by_points:
-                said = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
+            if proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only:
+                unused = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
-            said = "not used, because the frames of its points are unknown. To use it, set "
-            said += "{frame_by_recorded_name: {POINT: FRAME}, use: true}"
+            unused = "not used, because the frames of its points are unknown. To use it, set "
+            unused += "{frame_by_recorded_name: {POINT: FRAME}, use: true}"
         if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
             why = "torques with noise move the arm. To use it, set model.arms.mode: prescribed and use: true here"
-            said = f"not used, because {why if proposal.arm_mode == 'driven' else 'its frame is unknown, see below'}"
+            unused = f"not used, because {why if proposal.arm_mode == 'driven' else 'its frame is unknown, see below'}"
         elif group.startswith(ESTIMATED_WRENCH_GROUP_NAME):
-            said = "not used: the robot's driver computes it from joint torques. Use it only in place of efforts"
-        yield group, ["use: false"] * said.startswith("not used") + entries, said, places
+            unused = "not used: the robot's driver computes it from joint torques. Use it only in place of efforts"
+        yield group, ["use: false"] * bool(unused) + entries, unused or said, places

@@ -150,9 +150,8 @@ def _motion_result(run: RunSettings, found: _Plan, source: dict[str, Any]) -> di
         "format": "yid-plan/1",
         "status": "done" if found.is_successful else "failed",
         "message": found.message,
-        "goal": run.plan.goal,
         "duration": found.simulator.path.duration,
-        "settle": run.plan.hold_duration,
+        **attributes_to_dict(run.plan, "goal settle=hold_duration"),
         "joints": {
             joint.name: {
                 "velocity": _share(found.joint_velocities[:, i], joint.velocity_limit),
@@ -171,10 +170,9 @@ def _share(values: Array, limit: float) -> float | None:
 
 def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
-    own = attributes_to_dict(found, f"{names} std=end_position_std evaluations=n_evaluations")
-    asked = {"point": run.plan.point, "tolerance": run.plan.position_tolerance}
-    speeds = {"speed_tolerance": run.plan.point_rest_speed_tolerance}
-    return own | asked | speeds | {"time_step": found.simulator.step.time_step}
+    own = attributes_to_dict(found, f"{names} std=end_position_std evaluations=n_evaluations unfinished=is_unfinished")
+    tolerances = "point tolerance=position_tolerance speed_tolerance=point_rest_speed_tolerance"
+    return own | attributes_to_dict(run.plan, tolerances) | {"time_step": found.simulator.step.time_step}
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:

@@ -13,6 +13,7 @@ import numpy as np
 from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -132,10 +133,7 @@ def solution_to_result_dict(
         "status": solution.status.value,
         "message": solution.message,
         "parameters": {n: asdict(e) | {"meaning": meanings[n.split("[")[0]]} for n, e in solution.parameters.items()},
-        "cost": solution.cost,
-        "iterations": solution.n_iterations,
-        "evaluations": solution.n_evaluations,
-        "seconds": solution.wall_time,
+        **attributes_to_dict(solution, "cost iterations=n_iterations evaluations=n_evaluations seconds=wall_time"),
         "fit": asdict(solution.goodness_of_fit),
         "residuals": residuals,
         "held_out": [e | {"expected": dict(expected.get(e["recording"], {}))} for e in errors[: len(held_out)]],
