@@ -454,7 +454,7 @@ def parameter_estimates(
             pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
             # one-sided 95 % end: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
             reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)
-            interval = (value, value + reach) if side < 0 else (value - reach, value)
+            interval = (value, min(value + reach, high)) if side < 0 else (max(value - reach, low), value)
         initial = float(problem.initial_unknowns[at])
         result[name] = ParameterEstimate(value, std, entry.unit, initial, low, high, True, said, interval)
     return result
