@@ -502,7 +502,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     if wrong:
         names = " and ".join(wrong)
         rest = [entry["name"] for entry in runs if not entry["distrusted"]]
-        said = f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use {names}."
+        said = f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use them."
         if set(poor).intersection(rest):
             said = f"This does not make {names} doubtful, because not all other runs explain their recordings."
         yield f"The other runs ({abbreviated_names_text(rest)}) agree with each other much better than with {names}."
