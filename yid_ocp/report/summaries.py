@@ -403,6 +403,10 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     steps = {"plan with estimated values (RUN: run folder of solve)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
+    if result.get("distances"):
+        record = {
+            "tell the effects apart by FILE, a recording of this motion": "diagnose --set 'recordings.estimate=[FILE]'"
+        }
     if is_hopeless:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = {} if result["from"]["run"] or is_hopeless else steps
