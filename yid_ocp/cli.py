@@ -322,9 +322,10 @@ class _Parser(argparse.ArgumentParser):
         return [own for own in self._actions if own.required or not (own.option_strings or own.nargs == "?")]
 
     def _usage(self) -> str:
-        """Arguments that the command needs, such as `yid-ocp init ROBOT FILE ... --out CONFIG.yaml [OPTIONS]`."""
+        """Arguments that the command has, such as `yid-ocp init ROBOT FILE ... --out CONFIG.yaml [OPTIONS]`."""
         words = (" ".join([*own.option_strings[:1], str(own.metavar or own.dest)]) for own in self._needed())
-        return " ".join([self.prog, *words, "[OPTIONS]"])
+        optional = (f"[{own.metavar or own.dest}]" for own in self._actions if own.nargs == "?")
+        return " ".join([self.prog, *words, *optional, "[OPTIONS]"])
 
     def _help(self) -> str:
         return f"see {self.prog} --help"

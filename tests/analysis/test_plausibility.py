@@ -690,7 +690,7 @@ def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
 def test_noise_that_settings_state_ten_times_too_large(springs):
     (doubt,) = doubts(springs, std=1e-2)
     assert (doubt.cause, doubt.severity, doubt.group) == ("noise_overstated", "warning", "points_camera")
-    assert "the rms error of points_camera (noise and slow errors together) is 0.001 m" in doubt.what
+    assert "the errors of points_camera after the fit, slow ones included, have a std of 0.001 m per axis" in doubt.what
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"
     assert float(value) == pytest.approx(1e-3, rel=0.15)

@@ -131,10 +131,10 @@ def costing(cost: float, rows: int) -> Evaluation:
 
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
-    system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad") for name in names})
+    system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names})
     options = SimpleNamespace(divided_links_model=None)
     return SimpleNamespace(
-        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
+        has_process_noise=False, episodes=(), shared_parameters=names, system=system, held_out=(), options=options
     )
 
 

@@ -250,7 +250,7 @@ def test_friction_is_to_be_fitted_law_by_law(monkeypatch):
     assert all(EFFECTS[kind].is_joint_friction for kind in kinds)
     assert "yid-ocp friction" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
     monkeypatch.setattr(EffectBase, "is_joint_friction", True)
-    assert "`yid-ocp friction CONFIG` fits the friction" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+    assert "Compare friction laws by `yid-ocp friction`" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
 
 
 def test_effects_that_only_a_prior_separates_from_the_nominal_model_share_one_advice():

@@ -75,6 +75,8 @@ def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interv
     assert found.std == pytest.approx(spread, rel=1e-12)
     too_narrow = apply_profile_interval(stiffness(2.0, 1.0, "weak"), (1.1, 2.9), 10.0)
     assert too_narrow.interval == pytest.approx((0.04, 3.96), abs=1e-3)
+    at_bound = stiffness(9.0, 4.0, "not_trusted")
+    assert apply_profile_interval(replace(at_bound, upper=9.0), (8.9, None), 10.0).interval == (8.9, None)
 
 
 @pytest.mark.parametrize(("value", "std", "sufficient"), [(-10.0, 1.0, True), (0.1, 0.2, False)])

@@ -352,14 +352,15 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         seen = math.sqrt(max(squares) / free)
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
-        own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
+        own = [s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group]
+        axis = " per axis" * bool(own[0].sensor.point_names)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
         unit, least, size = units[group], QUALITY_LIMITS.max_overstatement_ratio, seen * usual
-        leaves = f"the rms error of {group} (noise and slow errors together) is {size:.2g} {unit} after the fit"
+        leaves = f"the errors of {group} after the fit, slow ones included, have a std of {size:.2g} {unit}{axis}"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"
         advice = "the large std makes every ± too wide, hides small gaps and can end the fit before its error is "
-        advice += "smallest. Until this issue is gone, fit again with a smaller std"
+        advice += f"smallest. Until this issue is gone, fit again with a smaller sensors.{group}.std"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {size:.2g}"
         if size < QUALITY_LIMITS.min_noise:
             advice, setting = "simulate with noise (`yid-ocp simulate --noise`), as no sensor has so little noise", ""

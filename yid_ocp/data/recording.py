@@ -350,7 +350,10 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     or if a speed or effort is beyond any machine. Three NaN are a point that was not seen; one or two are an error.
     """
     origin = where or f"recording '{recording.name}'"
-    allowed, hint = "joints, points or another sensor", "import some of them, too: `import FILE --preview` lists all"
+    allowed, hint = (
+        "joints, points or another sensor",
+        "import a file that has some, or more of its columns: `import FILE --preview` lists all",
+    )
     raise_data_error_unless(recording.all_groups, "the recording has no measurements", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))

@@ -51,8 +51,11 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     larger = "Record faster and larger motions, which show more effects."
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
+    pairs = ((own.recording.all_groups[0].t, own.grid) for own in result.nominal_model.problem.episodes)
+    is_cut = any(t[-1] > grid.node_times[-1] + grid.time_step for t, grid in pairs)
+    longer = _said((is_cut, "Set a longer problem.duration"), (True, "Record longer and larger motions"))[0]
     texts = {
-        "insufficient_data": "Record longer and larger motions, or free fewer parameters.",
+        "insufficient_data": f"{longer}, or free fewer parameters.",
         "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
@@ -100,7 +103,7 @@ def _lead(result: DiagnosisResult) -> str:
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
     gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
-    shown = f"would reveal {sum(seen)} of {len(seen)} effects if they existed"
+    shown = f"would reveal {sum(seen)} of {len(seen)} effects of the largest expected size"
     few = f"{tests[0].degrees_of_freedom:.0f} independent samples (more than {unknowns}, one per unknown, are needed)"
     beyond = ", but expect errors beyond noise" * (result.remaining_test.p_value < limits.significance_level)
     names = listed([effect.label for effect in result.accepted_effects])
@@ -113,7 +116,7 @@ def _lead(result: DiagnosisResult) -> str:
     probable = " ".join(_said(*shares))
     use = "Use the model for motions like these."
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
-    none = f"{use} There is no relevant gap: {sizes}. The recordings {shown}."
+    none = f"{use} There is no relevant gap: {sizes}. The recordings {shown}. Smaller ones may bias the estimates."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
     why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
@@ -170,7 +173,10 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
     named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
-    is_told = has_origin and origin in ("plant", "sensor", "either")
+    # an origin would contradict a mechanical place that cannot be told from a sensor
+    sensors, sets = {*groups, "camera", "clock"}, [{p.location, *p.indistinguishable_from} for p in where]
+    is_mixed = any(own & sensors and own - sensors for own in sets)
+    is_told = has_origin and not is_mixed and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
     return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 
@@ -220,17 +226,23 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = "Every second block of time is held out, as recordings.held_out is empty. Only `solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
-    divided = result.nominal_model.problem.options.divided_links_model
+    fitted, problem = result.nominal_model.values, result.nominal_model.problem
+    divided = problem.options.divided_links_model
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
+    free = [(name, problem.system.parameters[name]) for name in problem.shared_parameters if fitted[name] != 0]
+    at_bound = [name for name, entry in free if fitted[name] in (entry.lower, entry.upper)]
+    ended = f"In the fit of the nominal model, {listed(at_bound)} ended at a bound. This can cause the error."
+    widen = "Widen parameters.NAME.bounds of what ended at a bound, unless it is a physical limit, and repeat."
     return _said(
+        (result.verdict != "no_gap" and at_bound, (ended, widen)),
         (result.unknown_reason, _reason(result)),
         (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
         (result.untried, (f"{limit}{listed(result.untried)}.", _LONGER_SEARCH)),
-        (laws, (other, "Compare friction: `yid-ocp friction CONFIG` fits the friction laws side by side.")),
+        (laws, (other, "Compare friction laws by `yid-ocp friction`. It needs recordings of two motions or more.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),

@@ -368,8 +368,8 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
     An open end becomes the parameter's bound if the bound is within `scale` of the value (`scale` as in
     `parameter_verdict`). With two open ends the verdict is not_identifiable. With one open end it is at best weak, and
     std is infinite. Without open ends, the distance from the value to the farther end, divided by 1.96, decides the
-    verdict. It replaces std if std is less than half of it. If it is less than half of std, refits may have ended in
-    local minima, so the interval is value ± 1.96 std.
+    verdict. It replaces std if std is less than half of it. If it is less than half of std, and the value is not
+    at a bound, refits may have ended in local minima, so the interval is value ± 1.96 std.
     """
     order, (low, high) = ("identifiable", "weak", "not_identifiable"), interval
     if low is None and entry.value - entry.lower <= scale:
@@ -384,7 +384,7 @@ def apply_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterva
         wide = max(entry.value - low, high - entry.value) / math.sqrt(CHI2_95_TWO_SIDED)
         std = wide if _MIN_COST_RISE_RATIO * wide > entry.std else entry.std
         found = min(verdict_by_relative_std(entry.value, wide, scale), "weak", key=order.index)
-        if wide < _MIN_COST_RISE_RATIO * std < math.inf:
+        if wide < _MIN_COST_RISE_RATIO * std < math.inf and entry.value not in (entry.lower, entry.upper):
             reach = math.sqrt(CHI2_95_TWO_SIDED) * std
             interval = max(entry.value - reach, entry.lower), min(entry.value + reach, entry.upper)
     said = max(entry.verdict, found, key=order.index) if entry.verdict in order else entry.verdict
@@ -454,7 +454,7 @@ def parameter_estimates(
             pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
             # one-sided 95 % end: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
             reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)
-            interval = (value, value + reach) if side < 0 else (value - reach, value)
+            interval = (value, min(value + reach, high)) if side < 0 else (max(value - reach, low), value)
         initial = float(problem.initial_unknowns[at])
         result[name] = ParameterEstimate(value, std, entry.unit, initial, low, high, True, said, interval)
     return result

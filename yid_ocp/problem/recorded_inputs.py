@@ -144,7 +144,7 @@ def _courses(
     joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, PositionServo]
 ) -> list[scipy.interpolate.PPoly]:
     """Input of each joint over time, from the first sample to the end of the last sample's interval."""
-    t = joints.t
+    t, columns = joints.t, recorded_joint_column_indices(joints, driven, where)
     edges = np.append(t, 2 * t[-1] - t[-2])  # the last sample lasts as long as the previous one
     if servos:
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
@@ -154,7 +154,7 @@ def _courses(
             allowed = "the commanded position of every joint; or efforts of zero throughout if the motors are off"
             hint = "import commands (bag: --command-topic TOPIC), or let measured angles move the arm: mode: prescribed"
             raise DataError(what, where=f"recording '{where}': joints/position_command", allowed=allowed, hint=hint)
-        own = joints.position_command[:, recorded_joint_column_indices(joints, driven, where)]
+        own = joints.position_command[:, columns]
         times, rows = _with_lost_samples(t, own)
 
         def command(row: Array, name: str) -> scipy.interpolate.PPoly:
@@ -167,7 +167,7 @@ def _courses(
         what, allowed = "joint efforts drive the model, but the recording has none", "the effort of every driven joint"
         hint = "import a file with efforts, or set model.arms.mode: prescribed"
         raise DataError(what, where=f"recording '{where}': joints/effort", allowed=allowed, hint=hint)
-    effort = joints.effort[:, recorded_joint_column_indices(joints, driven, where)]
+    effort = joints.effort[:, columns]
     if joints.effort_sampling_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
     if joints.effort_sampling_kind_or_default == "command":

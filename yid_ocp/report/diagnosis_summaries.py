@@ -326,7 +326,7 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if not methods and not result["disturbed"]:
         yield SummaryStatement("No method ended an iteration. Raise compare.total_time_budget.", "conclusion")
         return
-    best = "best fit" if result["disturbed"] else f"{result['reference']} (best)"
+    best = "best fit" if result["disturbed"] else f"{result['reference']} (reference)"
     others = {m: e for m, e in methods.items() if result["disturbed"] or m != result["reference"]}
     runs = others | {best: judged}
     beside = [key for key in ("published", "truth") if result[key]]
@@ -488,8 +488,9 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, p = result["runs"], p_value_text(result["p_value"], "= ")
     drifted = [name for name, entry in result["parameters"].items() if entry["drifted"]]
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]
+    poor = [entry["name"] for entry in runs if not entry["explains"]]
     if not drifted and result["p_value"] >= result["level"]:
-        yield f"No parameter changed: all {len(runs)} runs agree within their uncertainty (p {p})."
+        yield f"{'' if poor else 'No parameter changed. '}All runs agree within their uncertainty (p {p})."
     elif not drifted:
         yield f"All parameters together differ between the runs (p {p}), but no single parameter does significantly."
     for name in drifted:
@@ -501,15 +502,22 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"{said} (noise alone: p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         names = " and ".join(wrong)
-        rest = abbreviated_names_text([entry["name"] for entry in runs if not entry["distrusted"]])
-        yield f"The other runs ({rest}) agree with each other much better than with {names}."
-        yield f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use {names}."
+        rest = [entry["name"] for entry in runs if not entry["distrusted"]]
+        said = f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use them."
+        if set(poor).intersection(rest):
+            said = f"This does not make {names} doubtful, because not all other runs explain their recordings."
+        yield f"The other runs ({abbreviated_names_text(rest)}) agree with each other much better than with {names}."
+        yield said
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
-    if poor := [entry["name"] for entry in runs if not entry["explains"]]:
-        text = f"The model did not explain the recordings of {', '.join(poor)}"
-        yield f"{text}. The ± of such a run includes the model error, but may still be too small."
+    yield _misfit_sentence(poor)
+
+
+def _misfit_sentence(runs: Sequence[str]) -> str:
+    """Return a sentence on runs whose model did not explain the recordings. Empty without such runs."""
+    said = f"The model did not explain the recordings of {abbreviated_names_text(runs)}."
+    return f"{said} The ± of such a run includes the model error, but may still be too small." if runs else ""
 
 
 @SUMMARIES.register("yid-overlay/1")
@@ -527,6 +535,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     names = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
     none = f"The two runs agree: no parameter differs {differ}."
     yield SummaryStatement(names if differing else none, "verdict")
+    yield _misfit_sentence(result.get("poor", ()))
     said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
     yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""
     yield SummaryTable(rows, "Estimates of both runs (± is one standard deviation)", is_key_table=True)

@@ -32,6 +32,7 @@ from yid_ocp.report.terminal import (
     bound_range_text,
     copyable_estimates_blocks,
     discretisation_shift_sentences,
+    is_at_bound,
     issue_descriptions,
     issue_summary_blocks,
     large_torque_offsets_sentence,
@@ -90,7 +91,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         std = "infinite" if verdict == "weak" else ""
         if entry["std"] is not None:
             std = f"{entry['std']:.2g}"
-        std *= verdict not in ("", "at_bound") and entry["value"] not in (entry["lower"], entry["upper"])
+        std *= bool(verdict) and not is_at_bound(entry)
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         value = "–" if verdict == "not_identifiable" or std == "infinite" else value
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
@@ -98,7 +99,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, value, std, interval, *more))
     is_useless = not (converged or is_trusted)
     yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True, is_page_only=is_useless)
-    rows = [("channel", "error", "unit", "samples")]
+    rows = [("channel", "error", "unit", "used samples")]
     for name, entry in result["residuals"].items():
         rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
     has_others = any(entry["rmse"] for entry in result["held_out"])
@@ -227,7 +228,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         yield f"{none}These recordings do not determine {abbreviated_names_text(causes)}. {do}"
     if weak:
         rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
-        text = f"Only weakly determined (± above 10 % and up to 400 %): {abbreviated_names_text(weak)}."
+        text = f"Only weakly determined (± above 10 %): {abbreviated_names_text(weak)}."
         yield f"{text} Use their 95 % intervals{rough}."
 
 
@@ -236,7 +237,7 @@ def _bound_sentences(free: Mapping[str, Mapping[str, Any]], explains: bool) -> I
     by_bound = dict[tuple[str, str], list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
-            if entry[side] is not None and math.isclose(entry["value"], entry[side], rel_tol=1e-9, abs_tol=1e-12):
+            if is_at_bound(entry, (side,)):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
                 if entry[side] == 0 and not explains:
@@ -269,6 +270,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", entry["std"]
             spread = spread if entry["value"] else f"{absolute:.2g} {entry['unit']}"
         interval = _interval_cell(entry, None if is_initial else absolute)
+        if is_at_bound(entry) and not is_initial:
+            spread = ""
+            interval *= entry["interval"] is not None
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
@@ -283,7 +287,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     together = [(own, names) for own in open_directions if len(names := _changed_names(own)) > 1]
     told = [name for own, names in together if own["verdict"] == "not_identifiable" for name in names]
     rest = abbreviated_names_text([name for name in weak if name not in told])
-    doubt = f" Only weakly determined (± above 10 % and up to 400 %): {rest}." * bool(rest)
+    doubt = f" Only weakly determined (± above 10 %): {rest}." * bool(rest)
     yield SummaryStatement(f"{failed}{start}{said}.{doubt}", "conclusion")
     asked = result["what_if"]
     answer, *details = _what_if_blocks(asked, len(parameters)) if asked else ("",)
@@ -296,7 +300,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     hidden = [own for own in result["directions"] if own["verdict"] == "not_identifiable"]
     unobserved = {own["unobserved_parameter"] for own in hidden}
     unseen = [name for name in parameters if name in unobserved]
-    yield f"No sensor observes {', '.join(unseen)}." if unseen else ""
+    yield f"Near these values, the readings hardly depend on {', '.join(unseen)}." if unseen else ""
     hidden = [own for own in hidden if not own["unobserved_parameter"]]  # the table has those of one parameter
     for cause, alike in grouped((own["hidden_by"] or own["words"], own) for own in hidden[:_MAX_DIRECTIONS]).items():
         changes = ", or ".join(own["hidden_change"] for own in alike)
@@ -398,6 +402,10 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     steps = {"plan with estimated values (RUN: run folder of solve)": "plan --set plan.parameter_run_folder=RUN"}
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
+    if result.get("distances"):
+        record = {
+            "tell the effects apart by FILE, a recording of this motion": "diagnose --set 'recordings.estimate=[FILE]'"
+        }
     if is_hopeless:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = {} if result["from"]["run"] or is_hopeless else steps

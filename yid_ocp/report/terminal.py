@@ -183,7 +183,8 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
         stds = {name: own.get("std_relative", own.get("std")) for name, own in parameters.items()}
         values = {name: 1.0 if "std_relative" in own else abs(own["value"]) for name, own in parameters.items()}
         limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
-        rough = abbreviated_names_text([n for n, std in stds.items() if std is not None and std <= limit * values[n]])
+        free = {name: std for name, std in stds.items() if std is not None and not is_at_bound(parameters[name])}
+        rough = abbreviated_names_text([name for name, std in free.items() if std <= limit * values[name]])
         said = f"Until then, take these values as rough: {rough}. Their ± includes the error of the model."
         yield SummaryStatement(said if rough else "", "conclusion")
 
@@ -231,6 +232,12 @@ def torque_offset_table(result: Mapping[str, Any]) -> SummaryTable:
         priors = dict.fromkeys(f"± {known['prior_std']:.2g}" for known in own if known is not None)
         rows.append((joint, *cells, ", ".join(priors)))
     return SummaryTable(rows, "Estimated constant errors of the torques [N m]", is_page_only=True)
+
+
+def is_at_bound(entry: Mapping[str, Any], sides: Sequence[str] = ("lower", "upper")) -> bool:
+    """Check whether an estimate lies at one of its bounds, of those on `sides`."""
+    bounds = [entry[side] for side in sides if entry.get(side) is not None]
+    return any(math.isclose(entry["value"], bound, rel_tol=1e-9, abs_tol=1e-12) for bound in bounds)
 
 
 def bound_range_text(entry: Mapping[str, Any], digits: int) -> str:
