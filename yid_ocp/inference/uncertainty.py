@@ -488,8 +488,8 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         return "It is not known whether the model explains the recordings."
     chi2 = f"{chi2_per_dof:.3g}" if chi2_per_dof < 1000 else f"{chi2_per_dof:.0f}"
     fraction = fit.get("noise_fraction", 1.0)
-    share = f", with {fraction:g} times the stated std" if fraction < 1 else ""
-    size = f"chi2 per degree of freedom is {chi2}; noise alone gives 1{share}"
+    noise = f"noise of {fraction:g} times the stated std" if fraction < 1 else "noise alone"
+    size = f"chi2 per degree of freedom is {chi2}; {noise} gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
         chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
         said = "The errors are larger than noise usually leaves them, so the model may lack a small effect"
@@ -498,8 +498,10 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    what = "units, signs, names and noise" if chi2_per_dof * fraction**2 > HOPELESS_CHI2 else "the stated noise"
-    return f"{said} To find the cause, check {what} and run `yid-ocp diagnose`." if with_advice else said
+    checks = "check the stated noise and " if fraction == 1 else ""
+    if chi2_per_dof * fraction**2 > HOPELESS_CHI2:
+        checks = "check units, signs, names and noise and "
+    return f"{said} To find the cause, {checks}run `yid-ocp diagnose`." if with_advice else said
 
 
 def overstated_noise_sentence(chi2_per_dof: float, p_value: float | None) -> str:

@@ -70,16 +70,18 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             still = " ".join(causes.get("weak_excitation", ()))
             texts += [*_found_and_lost(free, is_safe, mild, still), said]
         elif _names_by_verdict(free)["not_identifiable"]:
-            texts += ["The ± includes the error of the model. A better model may find what cannot be found now."]
+            texts += ["The error of the model widens all intervals. A better model may show what cannot be found now."]
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
-        chi2 = 0.0 if failed else fit["chi2_per_dof"] or 0.0
+        chi2 = 0.0 if failed else (fit["chi2_per_dof"] or 0.0) * fit.get("noise_fraction", 1.0) ** 2
         is_hopeless = chi2 > HOPELESS_CHI2
         why = result["message"].partition(". Set solver.")[0] if is_hopeless else result["message"]
         said = f"Do not use the values, because {said}: {why.removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
-        said += f" With {chi2:.0f} times the chi2 of noise, first check units, signs and names." * is_hopeless
+        said += (
+            f" With {chi2:.0f} times the chi2 of the stated noise, first check units, signs and names." * is_hopeless
+        )
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
@@ -99,9 +101,12 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, value, std, interval, *more))
     is_useless = not (converged or is_trusted)
     yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True, is_page_only=is_useless)
-    rows = [("channel", "error", "unit", "used samples")]
+    has_noise = any(entry.get("expected") for entry in result["residuals"].values())
+    rows = [("channel", "error", *["noise alone"] * has_noise, "unit", "used samples")]
     for name, entry in result["residuals"].items():
-        rows.append((name, *value_text_and_display_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
+        sizes = [entry["rmse"], *[entry.get("expected")] * has_noise]
+        shown = [value_text_and_display_unit(size, entry["unit"]) for size in sizes]
+        rows.append((name, *(text for text, _ in shown), shown[0][1], str(entry["n"])))
     has_others = any(entry["rmse"] for entry in result["held_out"])
     yield SummaryTable(rows, "Errors (rms; of points: distance) on the fitted recordings", is_page_only=has_others)
     yield from _held_out_blocks(result)

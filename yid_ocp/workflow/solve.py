@@ -14,6 +14,7 @@ from yid_ocp.analysis import discretisation, estimation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.files import attributes_to_dict
+from yid_ocp.inference import null_test
 from yid_ocp.inference.uncertainty import EstimateChecksBeyondFit, covariance_to_dict
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
@@ -127,6 +128,9 @@ def solution_to_result_dict(
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, _, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
+    levels = () if problem.has_process_noise else null_test.assumed_channel_noise_levels(problem)
+    share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
+    noise = {own.channel: share * own.noise_rmse for own in levels}
     meanings = {own.name: own.description for own in problem.system.parameters}
     return {
         "format": "yid-solve/1",
@@ -135,6 +139,6 @@ def solution_to_result_dict(
         "parameters": {n: asdict(e) | {"meaning": meanings[n.split("[")[0]]} for n, e in solution.parameters.items()},
         **attributes_to_dict(solution, "cost iterations=n_iterations evaluations=n_evaluations seconds=wall_time"),
         "fit": asdict(solution.goodness_of_fit),
-        "residuals": residuals,
+        "residuals": {channel: own | {"expected": noise.get(channel)} for channel, own in residuals.items()},
         "held_out": [e | {"expected": dict(expected.get(e["recording"], {}))} for e in errors[: len(held_out)]],
     }
