@@ -117,7 +117,11 @@ def test_a_solve_says_what_is_not_found():
     assert many[at + 1 : at + 4] == [f"  --set parameters.{own}.free=false" for own in "bcd"]
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
-    parts = "the fit did not converge", "limit after 4 iterations in all starts", "2000 times the chi2 of noise, first"
+    parts = (
+        "the fit did not converge",
+        "limit after 4 iterations in all starts",
+        "2000 times the chi2 of the stated noise, first",
+    )
     assert [part in said for part in (*parts, "do not determine", "does not explain")] == [True] * 3 + [False] * 2
     lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
@@ -267,7 +271,7 @@ def test_what_is_hidden_is_told_by_its_cause():
     found = [alone | {"unobserved_parameter": "a"}, *changes, alone]
     parameters = {name: judged("not_identifiable") for name in "abc"}
     lines = told("yid-identifiability/1", information(parameters=parameters, directions=found))
-    at = lines.index("No sensor observes a.")
+    at = lines.index("Near these values, the readings hardly depend on a.")
     said = "These recordings cannot distinguish a change of b, or a change of c from a start."
     assert lines[at + 1 : at + 3] == [said, "W."]
 
