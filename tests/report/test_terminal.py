@@ -196,11 +196,11 @@ def test_an_interval_is_shown_of_every_number_that_is_known():
 def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
-    more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": "model.object.links: 8"}}
+    more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": ["model.object.links: 8"]}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
     arm = {"a": {"encoder_noise": 0.5, "std": 0.1}}
-    cutoff = {"discretisation": arm, "finer_settings": {"encoder_noise": "problem.path_cutoff: 4"}}
+    cutoff = {"discretisation": arm, "finer_settings": {"encoder_noise": ["problem.path_cutoff: 4"]}}
     text = " ".join(told("yid-solve/1", solved(**cutoff)))
     assert "set problem.path_cutoff: 4 (at least the highest frequency of the arm), and solve again." in text
     assert "--set problem.path_cutoff=4 " in text, "the command has the value alone"

@@ -14,7 +14,7 @@ import scipy.optimize
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
@@ -340,12 +340,12 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
     return fine.with_episodes(episodes, (), filters)
 
 
-def finer_setting_texts(problem: EstimationProblem) -> dict[str, str]:
+def finer_settings(problem: EstimationProblem) -> dict[str, list[str]]:
     """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise."""
     divided = problem.options.divided_links_model
-    found = {"links": divided.setting_text} if divided is not None and divided.setting_text else {}
-    found["time_step"] = f"problem.time_step: {problem.step.time_step / 2:g}"
-    return found | {"encoder_noise": f"problem.path_cutoff: {problem.options.path_cutoff / 2:g}"}
+    found = {"links": [*divided.settings]} if divided is not None else {}
+    found["time_step"] = [f"problem.time_step: {problem.step.time_step / 2:g}"]
+    return found | {"encoder_noise": [f"problem.path_cutoff: {problem.options.path_cutoff / 2:g}"]}
 
 
 def parameter_shifts_at_finer_discretisation(
@@ -362,9 +362,10 @@ def parameter_shifts_at_finer_discretisation(
     quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
-    notes, settings = list[str](), finer_setting_texts(problem)
+    notes, settings = list[str](), finer_settings(problem)
     for key in kinds:
         words = _REFINEMENT_DESCRIPTIONS[key]
+        finer = abbreviated_names_text(settings.get(key, ()))
         if key == "links" and not _has_divisible_links(problem):
             continue
         progress.begin_stage(f"trying {words}", 2.5, 2.7)
@@ -373,7 +374,7 @@ def parameter_shifts_at_finer_discretisation(
         except YidError as error:
             own = error.what
         if isinstance(own, str):
-            remedy = f"To see it, set {settings[key]}, run `solve` again and compare the estimates."
+            remedy = f"To see it, set {finer}, run `solve` again and compare the estimates."
             usable = "The estimates may be used, but their ± leaves this error out."
             notes.append(f"Whether {words} would change the estimates is unknown: {own}. {usable} {remedy}")
         else:
@@ -381,7 +382,7 @@ def parameter_shifts_at_finer_discretisation(
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             if excess - rest > max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left)):
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
-                notes.append(f"{said}. First set {settings[key]}, and run `solve` again.")
+                notes.append(f"{said}. First set {finer}, and run `solve` again.")
     if kinds and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()

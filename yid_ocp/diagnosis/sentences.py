@@ -245,7 +245,10 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (laws, (other, "Compare friction laws by `yid-ocp friction`. It needs recordings of two motions or more.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
-        (result.is_corrected_for_links, (links, f"For other commands, set {divided and divided.setting_text}.")),
+        (
+            result.is_corrected_for_links,
+            (links, f"For other commands, set {listed(divided.settings) if divided else None}."),
+        ),
     )
 
 

@@ -61,7 +61,7 @@ class DividedLinksModel:
 
     build_step: Callable[[bool, Sequence[EffectBase]], Step]  # of whether it is compiled, and of further effects
     parameter_factors: Mapping[str, float]
-    setting_text: str = ""  # settings, with keys and values, that divide the links
+    settings: tuple[str, ...] = ()  # with keys and values, which divide the links
 
 
 @dataclass(frozen=True)

@@ -129,9 +129,10 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
         return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
     lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
     notes, cures = " ".join(result.get("discretisation_notes", ())), discretisation_shift_sentences(result)[1]
-    finer = [text for text in result.get("finer_settings", {}).values() if text in cures or f"set {text}," in notes]
-    options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in finer)
-    steps = {"estimate again with the finer model": f"solve {options}"} if finer else {}
+    settings = result.get("finer_settings", {}).values()
+    cures += (text for own in settings if f"set {abbreviated_names_text(own)}," in notes for text in own)
+    options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in dict.fromkeys(cures))
+    steps = {"estimate again with the finer model": f"solve {options}"} if cures else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
         steps["find what the model lacks, as advised above"] = "diagnose"
     steps |= {"estimate again, after the advice above is followed": "solve"} if issues else {}

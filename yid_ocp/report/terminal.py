@@ -203,15 +203,19 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> tuple[list[str]
         if moved:
             worst = max(moved, key=moved.__getitem__)
             change = f"most of all {worst} (by {tried[worst][key]:+.2g}{units.get(worst, '')}). The ± includes this."
-            cures += [settings[key]] if settings.get(key) else []
+            cures += settings.get(key, ())
             many = count_with_noun(len(moved), "estimate")
             said.append(f"{words.capitalize()} would change {many} by more than noise, {change}")
         elif tried:
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
         said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
-    remark = " (at least the highest frequency of the arm)" * (settings.get("encoder_noise") in cures)
-    return said + ([f"For a smaller ±, set {' and '.join(cures)}{remark}, and solve again."] if cures else []), cures
+    remark = " (at least the highest frequency of the arm)" * (
+        not {*settings.get("encoder_noise", ())}.isdisjoint(cures)
+    )
+    return said + (
+        [f"For a smaller ±, set {abbreviated_names_text(cures)}{remark}, and solve again."] if cures else []
+    ), cures
 
 
 def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:

@@ -85,7 +85,7 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
     divided: DividedLinksModel | None = None
     if item is not None and item.uniform_or_total_link_count is not None:
         scales = {name: float(build.link_division_parameter_scale(run, name, 2)) for name in parameters.names}
-        divided = DividedLinksModel(partial(_divided_links_step, run), scales, item.divided_links_setting_text)
+        divided = DividedLinksModel(partial(_divided_links_step, run), scales, item.divided_links_settings)
     kinds: dict[str, tuple[RefinementKind, ...]] = {"time_step": ("time_step",), "both": ("links", "time_step")}
     if cable is not None and item is not None:
         clamps = cable.clamp_pose_point_names

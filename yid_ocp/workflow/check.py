@@ -231,7 +231,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         links = f"the number of links goes from {count} to {2 * count}"
         per_joint = [name for name in values if link_division_parameter_scale(run, name, 2) != 1]
         double = f" and double the initial values per joint ({abbreviated_names_text(per_joint)})" * bool(per_joint)
-        _warn(found, "the links are", links, f"{item.divided_links_setting_text}{double}", rows)
+        _warn(found, "the links are", links, f"{abbreviated_names_text(item.divided_links_settings)}{double}", rows)
     return found
 
 

@@ -57,7 +57,7 @@ def run_solve(
                 name: {**asdict(own), "std": checks.data_std.get(name)}
                 for name, own in checks.discretisation_shifts.items()
             },
-            "finer_settings": discretisation.finer_setting_texts(problem),
+            "finer_settings": discretisation.finer_settings(problem),
             "discretisation_notes": list(checks.notes),
             "stability": checks.step_stability,
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),

@@ -14,7 +14,6 @@ from annotated_types import Ge, Le
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, Vector3
-from yid_ocp.display import abbreviated_names_text
 from yid_ocp.errors import ConfigError, ModelError, require_known_names
 from yid_ocp.model.flexible import FlexibleObject, FlexibleSegment, flexible_object
 from yid_ocp.model.mechanism import transform_from_xyz_rpy
@@ -227,12 +226,12 @@ class ObjectBuilder:
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     @property
-    def divided_links_setting_text(self) -> str:
+    def divided_links_settings(self) -> tuple[str, ...]:
         """The settings, with whole keys, that divide each link in two."""
         halved = self.segment_definitions(link_division=2)
         counts = [f"links: {s.links}" if s.link_lengths is None else f"link_lengths: {s.link_lengths}" for s in halved]
         texts = [f"{self.segment_key.format(s.name)}.{count}" for s, count in zip(halved, counts, strict=True)]
-        return abbreviated_names_text(list(dict.fromkeys(texts)))
+        return tuple(dict.fromkeys(texts))
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Return the factor on a parameter that keeps its segment as stiff and damped if each link is divided."""
