@@ -134,7 +134,7 @@ def problem_of(*names: str) -> SimpleNamespace:
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names})
     options = SimpleNamespace(divided_links_model=None)
     return SimpleNamespace(
-        has_process_noise=False, episodes=(), shared_parameters=names, system=system, held_out=(), options=options
+        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
     )
 
 

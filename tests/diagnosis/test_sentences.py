@@ -268,7 +268,7 @@ def test_effects_that_cannot_be_told_apart_are_to_be_separated_where_the_data_su
     assert recommended_experiment_text(alike).startswith("Move elbow and wrist one after the other")
     others = finding("effect", selected_effects=(added(FRICTION),)), replace(alike, verdict="insufficient_data")
     sole, few = map(recommended_experiment_text, others)
-    assert (sole[:20], few[:25]) == ("Record and diagnose ", "Record longer and larger ")
+    assert (sole[:20], few[:25]) == ("Record and diagnose ", "Raise problem.duration if")
 
 
 if __name__ == "__main__":

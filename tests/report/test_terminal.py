@@ -147,8 +147,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
         text = " ".join(told("yid-solve/1", solved(fit=fit, parameters=lost, issues=issues)))
         assert ("start values of k (1.3e+06 N m/rad): near them" in text) == (name == "b"), "k does not move"
         assert ("noise of 0.1 times the stated std gives 1" in text) == (fraction < 1)
-        unknown = "A better model may show what cannot be found now." in text
-        assert (unknown, "do not determine" in text, "--what-if" in text) == (True, False, False)
+        assert ("do not determine" in text, "--what-if" in text) == (False, False)
     lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in " ".join(lines[:7])
     assert "The model does not explain the recordings, so agreement of methods does not confirm the values." in lines
@@ -229,8 +228,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     halves = {"gauss_newton": solved(), "late": solved(status="stopped"), "short": solved(status="iteration_limit")}
     ends = line_of(told("yid-compare/1", compared(methods=halves)), "status").split()[1:]
     assert ends == ["converged", "time", "limit", "iteration", "limit"]
-    lines = told("yid-compare/1", compared())
-    assert (lines[0], "All methods of the table fit equally well: their costs hardly differ." in lines) == (said, True)
+    assert told("yid-compare/1", compared())[0] == said
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():

@@ -187,7 +187,7 @@ def test_sources_that_differ_in_a_number_are_one_row(odd, printed):
 def test_no_command_is_suggested_that_would_fail(odd, printed):
     (odd / "run.csv").write_text("t,bend,c\n0,1,1\n1,2,1\n")
     told = printed("import", "run.csv", "--preview")
-    parts = "the import needs more information", "--columns 'bend=position:JOINT,c=skip'", "yid-ocp import"
+    parts = "the import needs more information", "--columns COLUMN=position:JOINT", "yid-ocp import"
     assert [part in told for part in parts] == [True, True, False]
 
 

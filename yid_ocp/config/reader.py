@@ -330,8 +330,7 @@ class _Reader:
             factor = _FACTORS.get((given, unit), float(given == unit)) * (match[1].count(".") < 2)
             number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
             advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
-        found = map(options.variadic_tuple_entry_type, options.non_none_union_members(hint))
-        entries = [entry for entry in found if entry is not None]
+        entries = [own for own in map(options.variadic_tuple_entry_type, options.non_none_union_members(hint)) if own]
         are_sections = any(schema.section_variants_from_annotation(entry) is not None for entry in entries)
         if entries and (isinstance(raw, dict) or (isinstance(raw, str) and not are_sections)):
             advice = f"write it as a list of one entry: [{_shown(raw)}]"

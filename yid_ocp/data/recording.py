@@ -350,10 +350,8 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     or if a speed or effort is beyond any machine. Three NaN are a point that was not seen; one or two are an error.
     """
     origin = where or f"recording '{recording.name}'"
-    allowed, hint = (
-        "joints, points or another sensor",
-        "import a file that has some, or more of its columns: `import FILE --preview` lists all",
-    )
+    allowed = "numbers of joints, points or another sensor"
+    hint = "import more of the file, or another one. Columns of a table with numbers: --columns COLUMN=position:JOINT"
     raise_data_error_unless(recording.all_groups, "the recording has no measurements", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))

@@ -51,11 +51,8 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     larger = "Record faster and larger motions, which show more effects."
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
-    pairs = ((own.recording.all_groups[0].t, own.grid) for own in result.nominal_model.problem.episodes)
-    is_cut = any(t[-1] > grid.node_times[-1] + grid.time_step for t, grid in pairs)
-    longer = _said((is_cut, "Set a longer problem.duration"), (True, "Record longer and larger motions"))[0]
     texts = {
-        "insufficient_data": f"{longer}, or free fewer parameters.",
+        "insufficient_data": "Raise problem.duration if it is set, record longer motions, or free fewer parameters.",
         "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
@@ -173,10 +170,9 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
     named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
-    # an origin would contradict a mechanical place that cannot be told from a sensor
-    sensors, sets = {*groups, "camera", "clock"}, [{p.location, *p.indistinguishable_from} for p in where]
-    is_mixed = any(own & sensors and own - sensors for own in sets)
-    is_told = has_origin and not is_mixed and origin in ("plant", "sensor", "either")
+    rivals = {name for p in where if p.indistinguishable_from for name in (p.location, *p.indistinguishable_from)}
+    is_unsure = bool(rivals & {*groups, "camera", "clock"})  # whether a place or a sensor
+    is_told = has_origin and not is_unsure and origin in ("plant", "sensor", "either")
     side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
     return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 

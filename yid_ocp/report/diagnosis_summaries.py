@@ -49,7 +49,6 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
-_MAX_EQUAL_COST_SPREAD = 0.1  # largest difference of costs of equally good fits; 0.5 is one standard deviation
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -73,9 +72,6 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     yield SummaryTable(rows, "Errors (rms) on held-out recordings", is_key_table=True)
-    is_computed = any(channel.startswith("joints.effort.") for channel in noise or ())
-    said = "Noise alone of efforts includes that of the joint angles, from which the model computes torques."
-    yield said if is_computed else ""
     rows = [("channel", "recording", "from [s]", "to [s]", "peak", "unit", "impulse", "unit of the impulse")]
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
@@ -89,7 +85,6 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield possible if any("possible" in row for row in fitted) else ""
     is_page_only = len(fitted) > 1 or verdict == "no gap"
     yield SummaryTable(untried, "Effects that were not fitted, with forecasts of their size", is_page_only=is_page_only)
-    yield "result.json has the p-values of all screened effects." if result["which"] else ""
     yield unseen_effects_sentence(result.get("unseen", ())) if verdict != "no gap" else ""
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{', '.join(kinds)} ({_SIGNAL_TEXTS.get(signals, signals)})" for signals, kinds in missing]
@@ -298,7 +293,6 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if len(names) > _MAX_TERMINAL_PARAMETERS:
         rows = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
-    yield from () if alike is None else _consistency_blocks(alike)
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[tuple[str, str], str]) -> Iterator[Sequence[str]]:
@@ -351,10 +345,6 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = rows if verdicts - {"not_identifiable"} or beside else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
     yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
-    costs = [entry["whitened_cost"] for entry in methods.values()]
-    is_equal = None not in costs and max(costs, default=0.0) - min(costs, default=0.0) < _MAX_EQUAL_COST_SPREAD
-    said = "All methods of the table fit equally well: their costs hardly differ."
-    yield said if is_equal and not result["disturbed"] else ""
     for name, entry in known.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
@@ -437,9 +427,6 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
         constants.append((joint, *(known.get(symbol, "") for symbol in symbols)))
     yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
-    sure = [name for name in friction if "@" in name and fitted[name]["verdict"] == "identifiable"]
-    rubbing = abbreviated_names_text(list(dict.fromkeys(name.rpartition(".")[0].rpartition("@")[2] for name in sure)))
-    yield f"Friction beyond viscous friction is found at: {rubbing}." if sure else ""
     yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
@@ -460,7 +447,7 @@ def _friction_constant_words(name: str, unit: str) -> str:
 @SUMMARIES.register("yid-history/1")
 def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     runs = [entry["name"] for entry in result["runs"]]
-    rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p-value", "verdict")]
+    rows: TableRows = [("parameter", *runs, "mean of all", "unit", "p-value of noise alone", "verdict")]
     for name, entry in result["parameters"].items():
         own = entry["values"]
         cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
@@ -469,19 +456,6 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, *cells, together, shown_unit(entry["unit"]), p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
     yield SummaryTable(rows, "Estimates of each run (± is one standard deviation)", is_key_table=True)
-    yield from _consistency_blocks(result)
-
-
-def _consistency_blocks(history: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    heads = "chi2", "expected chi2", "p-value", "differs most in", "explained by model"
-    rows: TableRows = [("run", *heads, "verdict")]
-    for entry in history["runs"]:
-        apart = (f"{entry['chi2']:.3g}", f"{entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
-        verdict = "yes" if entry["explains"] else "no", "differs" if entry["distrusted"] else ""
-        rows.append((entry["name"], *apart, *verdict))
-    # of two runs, both rows would have the same numbers
-    yield SummaryTable(rows if len(history["runs"]) > 2 else [], "Difference of each run from the others")
-    yield "p-value: probability that noise alone causes such a difference."
 
 
 def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
@@ -490,9 +464,9 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if not drifted and result["p_value"] >= result["level"]:
-        yield f"{'' if poor else 'No parameter changed. '}All runs agree within their uncertainty (p {p})."
+        yield f"{'' if poor else 'No parameter changed. '}All runs agree within their uncertainty (noise alone: p {p})."
     elif not drifted:
-        yield f"All parameters together differ between the runs (p {p}), but no single parameter does significantly."
+        yield f"All parameters together differ between the runs (noise alone: p {p}), but no single parameter does."
     for name in drifted:
         entry = result["parameters"][name]
         (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
@@ -511,13 +485,9 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
-    yield _misfit_sentence(poor)
-
-
-def _misfit_sentence(runs: Sequence[str]) -> str:
-    """Return a sentence on runs whose model did not explain the recordings. Empty without such runs."""
-    said = f"The model did not explain the recordings of {abbreviated_names_text(runs)}."
-    return f"{said} The ± of such a run includes the model error, but may still be too small." if runs else ""
+    if poor:
+        text = f"The model did not explain the recordings of {abbreviated_names_text(poor)}"
+        yield f"{text}. The ± of such a run includes the model error, but may still be too small."
 
 
 @SUMMARIES.register("yid-overlay/1")
@@ -535,7 +505,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     names = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
     none = f"The two runs agree: no parameter differs {differ}."
     yield SummaryStatement(names if differing else none, "verdict")
-    yield _misfit_sentence(result.get("poor", ()))
+    yield f"The model did not explain the recordings of {', '.join(poor)}." if (poor := result.get("poor")) else ""
     said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
     yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""
     yield SummaryTable(rows, "Estimates of both runs (± is one standard deviation)", is_key_table=True)

@@ -69,8 +69,6 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
                 said = "The stated noise is too large to test whether the model explains the recordings."
             still = " ".join(causes.get("weak_excitation", ()))
             texts += [*_found_and_lost(free, is_safe, mild, still), said]
-        elif _names_by_verdict(free)["not_identifiable"]:
-            texts += ["The error of the model widens all intervals. A better model may show what cannot be found now."]
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
@@ -93,7 +91,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         std = "infinite" if verdict == "weak" else ""
         if entry["std"] is not None:
             std = f"{entry['std']:.2g}"
-        std *= bool(verdict) and not is_at_bound(entry)
+        std *= verdict not in ("", "at_bound") and not is_at_bound(entry)
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         value = "–" if verdict == "not_identifiable" or std == "infinite" else value
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
@@ -118,8 +116,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
     yield next_steps_table(result, _steps_after_solve(result, free))
-    which = "chosen fit" if result.get("safeguard") else "fit"
-    yield f"End of the {which}: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
+    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -275,11 +272,10 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         if std is not None:
             spread, absolute = f"{100 * std:.3g}" if std < 9.995 else "above 1000", entry["std"]
             spread = spread if entry["value"] else f"{absolute:.2g} {entry['unit']}"
-        interval = _interval_cell(entry, None if is_initial else absolute)
-        if is_at_bound(entry) and not is_initial:
-            spread = ""
-            interval *= entry["interval"] is not None
+        is_stopped = is_at_bound(entry) and not is_initial
+        interval = _interval_cell(entry, None if is_initial or is_stopped else absolute)
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
+        spread *= not is_stopped
         rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
@@ -409,9 +405,7 @@ def _plan_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     longer = {"try twice the duration": f"plan --set plan.duration={2 * result['duration']:g}"}
     record = {"estimate from FILE, a recording of this motion": "solve --set 'recordings.estimate=[FILE]'"}
     if result.get("distances"):
-        record = {
-            "tell the effects apart by FILE, a recording of this motion": "diagnose --set 'recordings.estimate=[FILE]'"
-        }
+        record = {"diagnose FILE, a recording of this motion": "diagnose --set 'recordings.estimate=[FILE]'"}
     if is_hopeless:
         record = {"rank other experiments (takes minutes)": "identifiability --what-if"}
     steps = {} if result["from"]["run"] or is_hopeless else steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -70,24 +70,23 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
     """Print the contents of files, the recordings they would become, and the command that imports them."""
-    found, said, texts = list[dict[str, Any]](), list[str](), set[str]()
+    found, said = list[dict[str, Any]](), list[str]()
     for file in arguments.files:
         with stderr_progress_display(arguments) as progress:
             progress.begin_stage(f"listing the contents of {file}")
             contents = preview_file(file, progress)
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
             sources = [attributes_to_dict(own, keys) for own in contents.sources]
-            texts |= {own.name for own in contents.sources if own.kind == "text"}
             options = {**contents.reader_options, **asked}
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
             lines = importable_file_contents_lines(contents)
             if not has_native_recording_suffix(file):
-                lines += _proposal_lines([file], options, progress, texts)
+                lines += _proposal_lines([file], options, progress)
         said += [*([f"{file}:"] if len(arguments.files) > 1 else []), *lines, ""]
     if len(arguments.files) > 1:
         options = _combined([*(own["options"] for own in found), asked])
         with stderr_progress_display(arguments) as progress:
-            said += _proposal_lines(arguments.files, options, progress, texts)
+            said += _proposal_lines(arguments.files, options, progress)
     if arguments.json:
         more = found[0] if len(found) == 1 else {"files": dict(zip(arguments.files, found, strict=True))}
         print_json({"format": _RESULT_FORMAT, "recording": None, **more})
@@ -110,22 +109,12 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return combined
 
 
-def _proposal_lines(
-    files: Sequence[str], options: Mapping[str, Any], progress: Progress, texts: Container[str]
-) -> list[str]:
-    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing.
-
-    `texts` are names of columns that have no numbers.
-    """
+def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
+    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing."""
     try:
         recording = _read(files, options, progress)
     except DataError as error:
-        columns = options.get("column_meanings") or {}
-        unknown = next((key for key, own in columns.items() if own == "skip" and key not in texts), "")
-        given = ",".join(f"{key}={own}" for key, own in {**columns, unknown: "position:JOINT"}.items())
-        has_hint = not unknown or "--columns" in error.hint
-        hint = error.hint if has_hint else f"give columns a meaning (also effort:JOINT, x:POINT): --columns '{given}'"
-        more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", hint)) if text]
+        more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"
     return ["", *recording_issue_lines(recording)[0], f"to import {what}:", f"  {_import_command_line(files, options)}"]
@@ -137,9 +126,9 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[l
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     kinds = {"warning": "warning", "not_trusted": "issue", "refused": "issue"}
-    keys = [f" (in CONFIG.yaml: {own.setting})" if own.setting else "" for own in found]
-    pairs = zip(found, keys, strict=True)
-    said = [f"{kinds[i.severity]} ({i.certainty_word}): {i.what}\n  try: {i.advice}{key}" for i, key in pairs]
+    keys = (f" (in CONFIG.yaml: {own.setting})" if own.setting else "" for own in found)
+    rows = zip((kinds[own.severity] for own in found), found, keys, strict=True)
+    said = [f"{kind} ({own.certainty_word}): {own.what}\n  try: {own.advice}{key}" for kind, own, key in rows]
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
     is_severe = bool(units) or any(own.severity != "warning" for own in found)

@@ -46,8 +46,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         hint = f"write --out {out.parent / (out.stem + '.yaml')}"
         raise ConfigError(f"'{out.name}' does not end in .yaml", where="--out", allowed=".yaml or .yml", hint=hint)
     if Path(robot).suffix.lower() in READERS:
-        robots = [f for f in arguments.files if f.startswith("package:") or Path(f).suffix in (".urdf", ".xml")]
-        first = [*robots, "ROBOT.urdf"][0]
+        robots = (f for f in arguments.files if f.startswith("package:") or f.endswith((".urdf", ".xml")))
+        first = next(robots, "ROBOT.urdf")
         order = shlex.join([first, robot, *(file for file in arguments.files if file != first)])
         what, allowed = f"{Path(robot).name} is a recording, not a robot", "a URDF or MJCF file, or package:NAME"
         hint = f"give the robot first: yid-ocp init {order} --out {out}"

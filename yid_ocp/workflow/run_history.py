@@ -355,8 +355,8 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     first, second = map(_settings, folders)
     told = {"format": "yid-overlay/1", "runs": runs, "parameters": parameters, "channels": channels}
     told["model_difference"] = "" if first is None else _difference(first, second)
-    fits = zip(labels, (result.get("fit", {}) for result in results), strict=True)
-    told["poor"] = [label for label, fit in fits if fit.get("explains") is False]
+    fits = {label: result.get("fit", {}) for label, result in zip(labels, results, strict=True)}
+    told["poor"] = [label for label, fit in fits.items() if fit.get("explains") is False]
     settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in folders}
