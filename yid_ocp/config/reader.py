@@ -339,8 +339,8 @@ class _Reader:
         if isinstance(raw, (list, str)) and named is not None and named.selector_key == "name":
             asked = [raw] if isinstance(raw, str) else [own for own in raw if isinstance(own, str)]
             meant = [next(iter(difflib.get_close_matches(own, named.classes, 1)), own) for own in asked]
-            entries = ", ".join(f"{own}: {{}}" for own in dict.fromkeys(meant))
-            advice = f"write a section, {self._name(path)}: {{{entries}}}, in place of {_shown(raw)}"
+            sections = ", ".join(f"{own}: {{}}" for own in dict.fromkeys(meant))
+            advice = f"write a section, {self._name(path)}: {{{sections}}}, in place of {_shown(raw)}"
         shown = f"{_shown(raw)} {unit}".rstrip() if type(raw) in (int, float) and not {*",'"} & {*unit} else _shown(raw)
         what = f"{self._name(path)} is {shown}, which is not allowed"
         return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
