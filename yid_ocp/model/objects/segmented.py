@@ -19,7 +19,7 @@ from yid_ocp.options import OptionInfo
 
 _NO_TURN = (0.0, 0.0, 0.0)
 _RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
-_BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
+_BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS [m, kg, m], also with ,ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
 
 
 @dataclass(frozen=True, kw_only=True)
