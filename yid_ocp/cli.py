@@ -314,7 +314,8 @@ class _Parser(argparse.ArgumentParser):
             about = {(*own.option_strings, own.metavar)[0]: f" ({own.help})" for own in self._needed() if own.help}
             hint = f"add {', '.join(name + about.get(name, '') for name in lacking[1].split(', '))}; {hint}"
         if wrong := re.fullmatch(r"argument (\S+): invalid (\w+) value: (.*)", message, re.DOTALL):
-            allowed, where = {"int": "a whole number", "float": "a number such as 0.5"}[wrong[2]], f"{self.prog} {wrong[1]}"
+            allowed = {"int": "a whole number", "float": "a number such as 0.5"}[wrong[2]]
+            where = f"{self.prog} {wrong[1]}"
             message = f"{wrong[1]} is {wrong[3]}, but must be {allowed}"
         raise ConfigError(message, where=where, allowed=allowed, hint=hint)
 
