@@ -295,8 +295,6 @@ class _Sensitivities:
 
 def _orthogonal_part(columns: Array, explained: Array) -> Array:
     """Return the part of each column that is orthogonal to all columns of `explained`."""
-    if explained.shape[1] == 0:
-        return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
     basis = vectors[:, singular > _RANK_RTOL * max(float(singular.max(initial=0.0)), 1e-300)]
     return np.asarray(columns - basis @ (basis.T @ columns))
