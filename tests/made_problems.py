@@ -9,6 +9,7 @@ import numpy as np
 from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation, ResidualVectorLayout
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers.base import Iterate, SolverResult, Status
@@ -81,6 +82,8 @@ class MadeUp:
     @property
     def positive_unknowns_mask(self) -> np.ndarray:
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
+
+    pack_unknowns = EstimationProblem.pack_unknowns
 
     @property
     def residual_rows(self) -> ResidualVectorLayout:

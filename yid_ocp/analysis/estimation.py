@@ -81,15 +81,18 @@ def add_intervals_and_checks(
 ) -> Solution:
     """Return the fit with intervals, discretisation errors, held-out predictions and data checks, as `solve` does."""
     start, problem = problem, solution.problem or problem
+    filters = problem.whitening_filters, problem.held_out_whitening_filters
     if solution.evaluation is not None:
-        problem = _with_equilibrium_guesses(problem, solution.evaluation.episode_predictions, ())
+        episodes = _with_equilibrium_guesses(problem.episodes, solution.evaluation.episode_predictions)
+        problem = problem.with_episodes(episodes, problem.held_out, *filters)
     solution, stability = _checked_solution_and_step_stability(start, problem, solution)
     solution = solution_with_profile_intervals(problem, solution, progress)
     data_std = solution.std
     solution, checks = add_discretisation_errors(problem, solution, progress)
     progress.begin_stage("predicting the held-out recordings" if problem.held_out else "checking the fit", 1.2, 1.5)
     held_out, expected = _predict_held_out_with_expected_errors(problem, solution.x)
-    problem = _with_equilibrium_guesses(problem, (), [outcome for _, outcome in held_out])
+    others = _with_equilibrium_guesses(problem.held_out, [outcome for _, outcome in held_out])
+    problem = problem.with_episodes(problem.episodes, others, *filters)
     solution, issues = _checked_solution_and_issues(problem, solution, held_out)
     checks = replace(checks, data_std=data_std, data_issues=issues, step_stability=stability)
     checks = replace(checks, held_out_predictions=tuple(held_out), expected_prediction_errors=expected)
@@ -97,19 +100,12 @@ def add_intervals_and_checks(
 
 
 def _with_equilibrium_guesses(
-    problem: EstimationProblem,
-    predictions: Sequence[EpisodePrediction],
-    held_out_predictions: Sequence[EpisodePrediction | str],
-) -> EstimationProblem:
-    """Return the problem in which later searches for equilibria start from the equilibria of the given predictions."""
-
-    def guessed(episodes: Sequence[Episode], found: Sequence[EpisodePrediction | str]) -> Sequence[Episode]:
-        pairs = zip(episodes, found or [""] * len(episodes), strict=True)
-        known = [(e, None if isinstance(own, str) else own.equilibrium_guess) for e, own in pairs]
-        return [e if guess is None else replace(e, equilibrium_guess=guess) for e, guess in known]
-
-    episodes, held_out = guessed(problem.episodes, predictions), guessed(problem.held_out, held_out_predictions)
-    return problem.with_episodes(episodes, held_out, problem.whitening_filters, problem.held_out_whitening_filters)
+    episodes: Sequence[Episode], predictions: Sequence[EpisodePrediction | str]
+) -> list[Episode]:
+    """Return the episodes, whose later searches for equilibria start from the equilibria of the given predictions."""
+    pairs = zip(episodes, predictions, strict=True)
+    known = [(e, None if isinstance(own, str) else own.equilibrium_guess) for e, own in pairs]
+    return [e if guess is None else replace(e, equilibrium_guess=guess) for e, guess in known]
 
 
 def add_discretisation_errors(

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, map_unknowns_to_problem, with_free_starts_and_grasps
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, with_free_starts_and_grasps
 from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -267,7 +267,7 @@ class ExperimentVariantSensitivityBuilder:
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
         problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
-        x = map_unknowns_to_problem(setting.x, base.unknown_names, problem)
+        x = problem.pack_unknowns(dict(zip(base.unknown_names, setting.x, strict=True)))
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise failed_rollout_error(evaluation.message, f"the experiment with {[*setup_changes] or 'no change'}")

@@ -147,7 +147,7 @@ def identifiability(
     require_known_names(wanted, names, "free parameter", "intervals", ConfigError)
     given = unknown_vector_from_solution(problem, solution)
     wide = with_free_starts_and_grasps(problem, start, grasp_std)
-    x = map_unknowns_to_problem(given, problem.unknown_names, wide)
+    x = wide.pack_unknowns(dict(zip(problem.unknown_names, given, strict=True)))
     # the matrices are small: threads of the linear algebra library cost more than they gain
     with threadpoolctl.threadpool_limits(1):
         as_solved, wide = wide is problem, problem_with_whitening_at(wide, x, rounds=2)
@@ -213,7 +213,7 @@ def unknown_vector_from_solution(problem: EstimationProblem, solution: Solution 
         return problem.initial_unknowns
     if isinstance(solution, Solution):
         # solvers may round beyond a bound
-        return np.clip(map_unknowns_to_problem(solution.x, solution.unknown_names, problem), *problem.bounds)
+        return problem.pack_unknowns(dict(zip(solution.unknown_names, solution.x, strict=True)))
     return checked_unknowns(problem, solution, "solution")
 
 
@@ -243,12 +243,6 @@ def with_free_starts_and_grasps(
     nominal = dict(zip(problem.system.parameters.names, problem.theta, strict=True))
     recordings = [episode.recording for episode in problem.episodes]
     return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
-
-
-def map_unknowns_to_problem(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Return the unknown vector of `other` with the values of `x` by name. Other entries have their initial values."""
-    known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
-    return np.array([known[name] for name in other.unknown_names])
 
 
 @dataclass(frozen=True)
@@ -301,8 +295,6 @@ class _Sensitivities:
 
 def _orthogonal_part(columns: Array, explained: Array) -> Array:
     """Return the part of each column that is orthogonal to all columns of `explained`."""
-    if explained.shape[1] == 0:
-        return columns
     vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
     basis = vectors[:, singular > _RANK_RTOL * max(float(singular.max(initial=0.0)), 1e-300)]
     return np.asarray(columns - basis @ (basis.T @ columns))

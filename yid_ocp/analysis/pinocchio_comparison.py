@@ -99,23 +99,13 @@ def compare_urdf_with_pinocchio(
 
 
 def _without(path: Path, links: Sequence[str]) -> str:
-    root = ElementTree.parse(check_input_file(path, MAX_TEXT_BYTES)).getroot()
-    dropped = set(links)
-    joints = root.findall("joint")
-    for _ in joints:
-        dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}
-    for joint in joints:
-        if _link(joint, "child") in dropped:
-            root.remove(joint)
-    for link in root.findall("link"):
-        if link.get("name") in dropped:
-            root.remove(link)
+    root, waiting = ElementTree.parse(check_input_file(path, MAX_TEXT_BYTES)).getroot(), list(links)
+    while waiting:
+        link = waiting.pop()
+        waiting += [end.attrib["link"] for end in root.findall(f"joint/parent[@link='{link}']/../child")]
+        for part in [*root.findall(f"link[@name='{link}']"), *root.findall(f"joint/child[@link='{link}']/..")]:
+            root.remove(part)
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _link(joint: ElementTree.Element, end: str) -> str:
-    named = joint.find(end)
-    return "" if named is None else named.get("link", "")
 
 
 def _place(configuration: Array, joint: Any, value: float) -> None:

@@ -320,8 +320,6 @@ class _Walk:
         return found
 
     def _others_step(self, s: Array, jacobian: Array, rows: Array, damping: float) -> Array:
-        if not len(self.others):
-            return np.zeros(0)
         low, high = (bound[self.others] - s[self.others] for bound in (self.lower, self.upper))
         return bounded_levenberg_marquardt_step(jacobian, rows, damping, low, high)
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 import scipy.sparse
-from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.sparse.csgraph import maximum_bipartite_matching, shortest_path
 
 from yid_ocp.analysis.step_symbols import NamedStepEquations
 from yid_ocp.arrays import Array, BoolArray
@@ -266,11 +266,8 @@ def _inverse_sparsity(mask: BoolArray) -> BoolArray:
     matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
     if count == 0 or np.any(matched < 0):
         return np.ones((count, count), bool)
-    reach = mask[matched]
-    for _ in range(int(np.ceil(np.log2(max(count, 2))))):
-        reach = _times(reach, reach)
     result = np.zeros_like(mask)
-    result[:, matched] = reach
+    result[:, matched] = np.isfinite(shortest_path(mask[matched], unweighted=True))
     return result
 
 
