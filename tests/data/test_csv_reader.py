@@ -127,7 +127,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "unknown column": ("t,q_a,label\n0,1,2\n", {}, "not known: label", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "not known: q_", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
-    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "has no measurements", "import FILE"),
+    "only time": ("t,label\n0,1\n", {"column_meanings": {"label": "skip"}}, "has no measurements", "import more"),
     "column not there": (GOOD, {"column_meanings": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
     "meaning of a column": (GOOD, {"column_meanings": {"q_a": "x:"}}, "meaning 'x:' of column", "q_a=x:NAME"),
     "meaning of times": (GOOD, {"column_meanings": {"t": "time"}}, "meaning 'time' of column", "'t=t'"),

@@ -330,9 +330,9 @@ class _Reader:
             factor = _FACTORS.get((given, unit), float(given == unit)) * (match[1].count(".") < 2)
             number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
             advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
-        entries = [own for own in map(options.variadic_tuple_entry_type, options.non_none_union_members(hint)) if own]
-        are_sections = any(schema.section_variants_from_annotation(entry) is not None for entry in entries)
-        if entries and (isinstance(raw, dict) or (isinstance(raw, str) and not are_sections)):
+        kinds = [own for own in map(options.variadic_tuple_entry_type, options.non_none_union_members(hint)) if own]
+        are_sections = any(schema.section_variants_from_annotation(kind) is not None for kind in kinds)
+        if kinds and (isinstance(raw, dict) or (isinstance(raw, str) and not are_sections)):
             advice = f"write it as a list of one entry: [{_shown(raw)}]"
         if isinstance(raw, str):
             advice = nearest_name_question(raw, options.literal_choices(hint)) or advice
