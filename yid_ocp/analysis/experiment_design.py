@@ -14,6 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, with_free_starts_and_grasps
+from yid_ocp.analysis.point_checks import point_frame_names
 from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -92,12 +93,10 @@ class UnchangedExperiment:
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
             choice = self.problem.options.sensors.get(group.name, SensorOptions())
-            for point in choice.used_points if choice.used_points is not None else group.names:
-                frame = choice.frame_by_recorded_name.get(point, point)
-                if self.problem.system.mechanism.has_frame(frame):
-                    at = group.names.index(point)
-                    seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+            for point, frame in point_frame_names(self.problem.system, group, choice).items():
+                at = group.names.index(point)
+                seen = np.all(np.isfinite(group.position[:, at]), axis=1)
+                found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
