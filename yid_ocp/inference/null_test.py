@@ -25,9 +25,8 @@ from yid_ocp.problem.measurements import SensorMeasurements, whiten_with_extra_e
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.predictions import held_out_rmse_and_unit_by_channel
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
@@ -415,7 +414,7 @@ def newey_west_covariance_of_scores(columns: Array, residual: Array, series: Seq
     return total
 
 
-def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float, nodes: IntArray) -> Array:
+def _noise_autocorrelation(low_pass: ZeroPhaseLowPassFilter | None, step: float, nodes: IntArray) -> Array:
     """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s], at some nodes."""
     if low_pass is None or not np.isfinite(low_pass.cutoff) or len(nodes) < 2:
         return np.ones(1)

@@ -36,9 +36,9 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     step_mean_inputs,
 )
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, slow_effort_filter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors import joints as joint_sensors
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter, slow_effort_filter, zero_phase_effort_filter
 
 
 @dataclass(frozen=True)
