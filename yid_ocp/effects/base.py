@@ -280,8 +280,6 @@ def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
     """Return the names of frames at the ends of the arm links, without fixed frames and without coincident ones."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
-    if not own:
-        return ()
     # the frame of a link is at the end of the previous link
     first = {f.joint_index: name for name, f in list(tree.frames.items())[::-1] if f.joint_index in own}
     names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
