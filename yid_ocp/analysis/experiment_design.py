@@ -19,10 +19,10 @@ from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.effects.base import frame_positions
 from yid_ocp.errors import DataError, SolverError, YidError, failed_rollout_error
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
@@ -449,15 +449,8 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
     whole[:, list(system.actuated_coordinate_indices)] = episode.measured_driven_angles
-    paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
+    paths = frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
     return float(np.linalg.norm(paths - paths[0], axis=2).max(initial=0.0)) or 0.11
-
-
-def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
-    symbol = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
-    at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
-    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
@@ -466,7 +459,7 @@ def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, A
     def direction(x: Array) -> Array:
         return np.asarray(x / max(float(np.linalg.norm(x)), 1e-9))
 
-    points = _frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
+    points = frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
     middle, held = points.mean(0), dict(zip(system.point_frames, points, strict=True))
     forward = _FORWARD_GRIPPER_OFFSET * direction(np.array([middle[0], middle[1], 0.0]))
     inward = {grasp.name: middle - held[grasp.held_frame] for grasp in system.grasps if grasp.held_frame in held}

@@ -10,8 +10,10 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, require_known_names
 from yid_ocp.model.flexible import ElasticJoint
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
@@ -284,7 +286,8 @@ def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
     first = {f.joint_index: name for name, f in list(tree.frames.items())[::-1] if f.joint_index in own}
     names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
     held = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    paths = _paths(system, (*names, *held))
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (3, system.n_coordinates))
+    paths = dict(zip((*names, *held), frame_positions(system, {}, (*names, *held), q).swapaxes(0, 1), strict=True))
     known = [path for name, path in paths.items() if name in held]
     found = []
     for name in dict.fromkeys(names):
@@ -314,14 +317,12 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Positions of frames in some random configurations, shape (configurations, 3) each [m]."""
-    q, kinematics = system.symbols_and_kinematics
-    places = ca.horzcat(*(kinematics.frame_position(name) for name in names))
-    function = ca.Function("places", [q, system.parameters.symbols], [places])
-    rng, theta = np.random.default_rng(0), system.parameters.vector()
-    at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, system.n_coordinates), theta))) for _ in range(3)]
-    return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
+def frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
+    """Compute the positions (N, nf, 3) [m] of frames at the configurations `q` (N, n), with parameter `values`."""
+    symbol = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
+    at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
+    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
