@@ -11,11 +11,9 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, require_known_names
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
@@ -175,32 +173,6 @@ class EffectBase(Effect):
 
 
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
-
-
-def make_effect_unchecked(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
-    """Create an effect of a registered kind at a location that `make_effect` has already checked."""
-    cls, label = EFFECTS[kind], f"{kind}@{location}"
-    definitions = cls.parameter_definitions(location, system)
-    names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
-    given: dict[str, float] = {}
-    require_known_names(values, names, "parameter", label, ConfigError)
-    for name, value in values.items():
-        definition = names[name]
-        if name != definition.name:
-            signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
-            if not (value > 0 or (signed and value < 0)):
-                allowed = f"{'a number other than zero' if signed else 'a positive number'} [{unit}]"
-                what, hint = f"{name} is {value}, but must be {allowed}", "correct the value, or leave it out"
-                raise ConfigError(what, where=label, allowed=allowed, hint=hint)
-            value = definition.internal_from_reported_value(value)
-        given[definition.name] = float(value)
-    entries = (
-        Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
-        for q in definitions
-    )
-    inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
-    internal = {name: ca.SX.sym(name) for name in inner}
-    return cls(kind, location, Parameters(entries), internal, definitions, joint_names_by_arm(system).get(location, ()))
 
 
 def flexible_segment_names(system: System) -> tuple[str, ...]:
