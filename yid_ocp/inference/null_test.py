@@ -42,7 +42,6 @@ class OutputResidualIndices:
     recording: str
     channel: str
     group: str
-    unit: str
     t: Array  # since the recording's start, shape (M,) [s]
     residual_indices: IntArray  # shape (M,)
     noise_autocorrelation: Array  # at lags 0 to L samples, shape (L + 1,)
@@ -387,7 +386,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputRe
             for column, channel in enumerate(samples.channel_name_per_output):
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
-                    text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
+                    text = (episode.name, channel, samples.sensor.group_name)
                     series.append(OutputResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
