@@ -16,7 +16,7 @@ def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, pe
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return OutputResidualIndices(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return OutputResidualIndices(recording, channel, "points", t, rows, np.asarray(colour, float))
 
 
 def without(recording: Recording, begin: float, end: float) -> Recording:

@@ -116,7 +116,7 @@ def test_series_springs_have_a_common_lower_end():
 )
 def test_what_nothing_informs_is_open_on_both_sides(rows, more, ends):
     found = profiled(Formula(rows, {"a": 3.0, "b": 5.0}, **more), std=math.inf)
-    assert (found.lower, found.upper, found.notes) == (None, None, ())
+    assert (found.interval, found.notes) == ((None, None), ())
     assert (found.values[0], found.values[-1]) == pytest.approx(ends)
     assert found.delta_chi2.max() < 0.1
 
@@ -149,8 +149,8 @@ def test_others_where_they_were_help_where_the_tangent_leads_too_far():
         return [x["a"] + x["b"] - 4.0, 0.5 * (x["b"] - 1.0)]
 
     found = profiled(Formula(rows, {"a": 3.0, "b": 1.0}, bounds=OPEN, fails=lambda v: v["b"] < 0.2))
-    assert found.lower == pytest.approx(3 - HALF * math.sqrt(5.0), rel=0.02)
-    assert 3 < found.upper < 3 + HALF * math.sqrt(5.0)
+    assert found.interval[0] == pytest.approx(3 - HALF * math.sqrt(5.0), rel=0.02)
+    assert 3 < found.interval[1] < 3 + HALF * math.sqrt(5.0)
 
 
 @pytest.mark.parametrize(("start", "is_said"), [(3.8, True), (3.1, False)])
@@ -162,7 +162,7 @@ def test_a_better_fit_that_is_met_on_the_way_is_said_and_counts_as_the_best(star
     said = [part in found.better_fit for part in ("(chi2 lower by 2.", "--set parameters.a.initial=")]
     assert (said, found.notes) == ([is_said] * 2, ())
     assert found.delta_chi2.min() == 0.0
-    assert found.lower == pytest.approx(3 - HALF / 2, rel=0.04)
+    assert found.interval[0] == pytest.approx(3 - HALF / 2, rel=0.04)
 
 
 def test_refits_leave_little_on_the_table():

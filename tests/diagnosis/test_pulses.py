@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate, _Rest, detect_force_pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import benjamini_hochberg_mask
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 T = 0.1 * np.arange(80)
 NOISE = 0.02

@@ -38,7 +38,7 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import whiten_with_extra_errors
 from yid_ocp.problem.options import ExcessResidualCriteria
-from yid_ocp.problem.signal_filters import zero_phase_effort_filter
+from yid_ocp.sensors.signal_filters import zero_phase_effort_filter
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 

@@ -22,7 +22,7 @@ from yid_ocp.model.objects.cable import (
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.solvers import GaussNewton, fit_problem
 
 PARENT = tuple(f"p{i}" for i in range(7))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from yid_ocp.problem.signal_filters import FirstOrderLag, ZeroPhaseLowPassFilter
+from yid_ocp.sensors.signal_filters import FirstOrderLag, ZeroPhaseLowPassFilter
 
 H, N = 0.01, 40
 RNG = np.random.default_rng(4)

@@ -19,7 +19,7 @@ from yid_ocp.problem.recorded_inputs import (
     step_mean_input_delay_derivative,
     step_mean_inputs,
 )
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter, zero_phase_effort_filter
 
 PLAIN = ZeroPhaseLowPassFilter(math.inf)
 

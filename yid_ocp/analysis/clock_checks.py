@@ -336,14 +336,12 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     if problem.options.excess_residual_criteria.noise_fraction_of_stated_std < 1.0:
         return  # the stated noise contains model error
     by_group: dict[str, list[tuple[float, float, int]]] = {}
-    units = {}
     for series in channels_with_residual_indices(problem):
         r = evaluation.residual[series.residual_indices]
         if len(r) >= MIN_DIFFERENCES_FOR_NOISE_STD:
             sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])
             entry = float(r @ r), float(sums @ sums) / _N_TIME_BLOCKS * len(r), len(r)
             by_group.setdefault(series.group, []).append(entry)
-            units[series.group] = series.unit
     for group, parts in by_group.items():
         *squares, count = (sum(column) for column in zip(*parts, strict=True))
         free = count - len(problem.initial_unknowns)
@@ -355,7 +353,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = [s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group]
         axis = " per axis" * bool(own[0].sensor.point_names)
         usual = float(np.median(np.concatenate([s.std[s.positive_weight_mask] for s in own])))
-        unit, least, size = units[group], QUALITY_LIMITS.max_overstatement_ratio, seen * usual
+        unit, least, size = own[0].sensor.unit, QUALITY_LIMITS.max_overstatement_ratio, seen * usual
         leaves = f"the errors of {group} after the fit, slow ones included, have a std of {size:.2g} {unit}{axis}"
         severity = 1 / (least * max(seen, 1e-9))
         times = f"{least * severity:.2g} times below the stated {usual:.2g} {unit} ({least:g} times is tolerated)"

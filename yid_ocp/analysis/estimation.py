@@ -162,15 +162,13 @@ def _checked_solution_and_step_stability(
     """Return the solution, marked as stalled if the time step is unstable, and stability data for result.json."""
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
-    end, unstable = growth(problem, solution.x), "the simulation is unstable at the"
-    found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
-    if end is not None and not end.keeps_errors_below_resolution:
-        status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
-        message = f"{unstable} estimate, because {end.stability_message}. Solver: {solution.message}"
-        return replace(solution, status=status, message=message), found
-    if solution.status == Status.FAILED and begin is not None and not begin.keeps_errors_below_resolution:
-        message = f"{unstable} start, because {begin.stability_message}. Solver: {solution.message}"
-        return replace(solution, message=message), found
+    growths = {"estimate": growth(problem, solution.x), "start": begin}
+    found = {place: _growth_result(growths[place]) for place in ("start", "estimate")}
+    for place, own in growths.items():
+        if own is not None and not own.keeps_errors_below_resolution:
+            status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
+            said = f"the simulation is unstable at the {place}, because {own.stability_message}"
+            return replace(solution, status=status, message=f"{said}. Solver: {solution.message}"), found
     return solution, found
 
 

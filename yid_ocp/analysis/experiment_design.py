@@ -14,20 +14,21 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, with_free_starts_and_grasps
+from yid_ocp.analysis.point_checks import point_frame_names
 from yid_ocp.analysis.torque_error_propagation import point_jacobians_and_joint_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.effects.base import frame_positions
 from yid_ocp.errors import DataError, SolverError, YidError, failed_rollout_error
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, compile_step_like
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.sensors import camera_pose_of_point_group
+from yid_ocp.sensors import PositionSensor, camera_pose_of_point_group
 from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -92,12 +93,10 @@ class UnchangedExperiment:
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
             choice = self.problem.options.sensors.get(group.name, SensorOptions())
-            for point in choice.used_points if choice.used_points is not None else group.names:
-                frame = choice.frame_by_recorded_name.get(point, point)
-                if self.problem.system.mechanism.has_frame(frame):
-                    at = group.names.index(point)
-                    seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
+            for point, frame in point_frame_names(self.problem.system, group, choice).items():
+                at = group.names.index(point)
+                seen = np.all(np.isfinite(group.position[:, at]), axis=1)
+                found.append(SinglePointObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -310,7 +309,7 @@ class ExperimentVariantSensitivityBuilder:
     def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
         """Return the problem with encoder readings of driven joints, or None if the recorded experiment has none."""
         base = self.setting.problem
-        used = any(samples.sensor.position_joints for e in base.episodes for samples in e.measurements)
+        used = any(isinstance(own.sensor, PositionSensor) for e in base.episodes for own in e.measurements)
         if not used or not problem.system.driven:
             return None
         sensors = dict(problem.options.sensors)
@@ -450,15 +449,8 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
     whole[:, list(system.actuated_coordinate_indices)] = episode.measured_driven_angles
-    paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
+    paths = frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
     return float(np.linalg.norm(paths - paths[0], axis=2).max(initial=0.0)) or 0.11
-
-
-def _frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
-    symbol = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
-    at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
-    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
@@ -467,7 +459,7 @@ def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, A
     def direction(x: Array) -> Array:
         return np.asarray(x / max(float(np.linalg.norm(x)), 1e-9))
 
-    points = _frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
+    points = frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
     middle, held = points.mean(0), dict(zip(system.point_frames, points, strict=True))
     forward = _FORWARD_GRIPPER_OFFSET * direction(np.array([middle[0], middle[1], 0.0]))
     inward = {grasp.name: middle - held[grasp.held_frame] for grasp in system.grasps if grasp.held_frame in held}

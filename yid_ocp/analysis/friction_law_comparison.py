@@ -17,7 +17,7 @@ from yid_ocp.problem.evaluation import episode_residual_and_jacobian
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles_at_nodes
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.solvers import GaussNewton, Solution
 
 _MAX_FOLD_ITERATIONS = 15

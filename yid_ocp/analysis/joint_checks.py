@@ -21,7 +21,6 @@ from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_deriva
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import expand_to_joint_values
 from yid_ocp.sensors.joints import (
@@ -30,6 +29,7 @@ from yid_ocp.sensors.joints import (
     is_noise_std_stated,
     joint_angle_noise_std,
 )
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _ANGLE_LIMIT_MARGIN = 0.1  # allowed excess over joint limits, because robots differ from their URDF [rad or m]
 _MAX_SPEED_RATIO = 1.5  # allowed ratio of a joint speed to the limit of the URDF

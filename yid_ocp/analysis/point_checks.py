@@ -46,7 +46,8 @@ class _Change(NamedTuple):
     channel: str = ""
 
 
-def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
+def point_frame_names(system: System, group: PointGroup, choice: SensorOptions) -> dict[str, str]:
+    """Return the model's frame of each recorded point that the settings `choice` use and the model has."""
     wanted = group.names if choice.used_points is None else choice.used_points
     frames = {name: choice.frame_by_recorded_name.get(name, name) for name in wanted if name in group.names}
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
@@ -60,7 +61,7 @@ def forward_kinematics_issues(arm: RecordedJointsModel, recording: Recording, op
     holders = {grasp.held_frame: grasp.holder_frame for grasp in arm.system.grasps}
     for group in recording.points:
         # for a grasped point, the frame of the arm that holds it
-        marked = _point_frames(arm.system, group, options(group.name))
+        marked = point_frame_names(arm.system, group, options(group.name))
         held = {name: holders.get(frame, frame) for name, frame in marked.items()}
         known = filter(arm.is_frame_determined_by_angles, dict.fromkeys(held.values()))
         moved = {frame for frame in known if tree.ancestor_joint_indices(tree.frame(frame).joint_index)}
@@ -224,7 +225,7 @@ def points_too_distant_issues(
     """Yield issues about points that are farther apart, or farther from the root, than the object is long."""
     mechanism = system.mechanism
     for group in recording.points:
-        frames = _point_frames(system, group, options(group.name))
+        frames = point_frame_names(system, group, options(group.name))
         found = {name: _distances(arm, system, theta, frame) for name, frame in frames.items()}
         ways = {name: way for name, way in found.items() if way is not None}
         noise = _noise(group)

@@ -44,19 +44,11 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 class ParameterProfileLikelihood:
     """Profile likelihood of one unknown: rise of chi2 at fixed values, with the others refitted, and 95 % interval."""
 
-    name: str
-    value: float
-    lower: float | None  # lower end of the 95 % interval; None if open
-    upper: float | None  # upper end, likewise
+    interval: uncertainty.ConfidenceInterval  # lower and upper end of the 95 % interval; None for an open end
     values: Array  # values at which the other unknowns were refitted, ascending, shape (k,)
     delta_chi2: Array  # (chi2 - best chi2) / max(1, chi2 per dof), shape (k,)
     notes: tuple[str, ...] = ()  # sentences on ends of the interval that were not found
     better_fit: str = ""  # a sentence on a better fit, if one was found
-
-    @property
-    def interval(self) -> uncertainty.ConfidenceInterval:
-        """The lower and upper end of the 95 % interval. An open end is None."""
-        return self.lower, self.upper
 
 
 def compute_profile_likelihood_interval(
@@ -74,7 +66,7 @@ def compute_profile_likelihood_interval(
     """
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
-    lower, upper = walk.end(-1, size), walk.end(1, size)
+    interval = walk.end(-1, size), walk.end(1, size)
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
@@ -84,8 +76,7 @@ def compute_profile_likelihood_interval(
         best, setting = f"{values[np.argmin(deltas)]:.4g}", f"parameters.{name.partition('[')[0]}.initial"
         better = f"a better fit exists at {best} (chi2 lower by {-walk.base:.2g}), so the fit missed the best value. "
         better += f"Repeat `yid-ocp solve` with --set {setting}={best}"
-    found = float(x[index]), lower, upper, values, deltas
-    return ParameterProfileLikelihood(name, *found, tuple(walk.notes), better)
+    return ParameterProfileLikelihood(interval, values, deltas, tuple(walk.notes), better)
 
 
 def solution_with_profile_intervals(

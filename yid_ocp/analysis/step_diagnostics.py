@@ -25,10 +25,8 @@ from yid_ocp.sensors import sensor_function_with_jacobians
 
 def step_complexity_summary(step: Step) -> dict[str, Any]:
     """Return the number of variables, unknowns, Jacobian nonzeros and operations of a step and of its functions."""
-    e, found = step.equations, []
-    for f in step.model.functions.all_functions:
-        nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
-        found.append({"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros})
+    e, functions = step.equations, step.model.functions.all_functions
+    found = [{"name": f.name(), "operations": f.n_instructions(), "nonzeros": f.nnz_out()} for f in functions]
     nonzeros = ca.jacobian_sparsity(e.residual, e.newton_unknowns).nnz()
     counts = {"unknowns": e.newton_unknowns.numel(), "jacobian_nonzeros": nonzeros}
     return {"sizes": step.sizes, **counts, "functions": found}

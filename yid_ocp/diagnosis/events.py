@@ -49,9 +49,9 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements, measurements_minus_sensor_error_estimates
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 from yid_ocp.sensors.joints import quantization_step
+from yid_ocp.sensors.signal_filters import zero_phase_effort_filter
 
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of the prediction."""

@@ -31,7 +31,7 @@ from yid_ocp.integrator.step import Step, actuated_joint_torques_of_rollout
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import MidpointStateSymbols, System
-from yid_ocp.problem.signal_filters import zero_phase_effort_filter
+from yid_ocp.sensors.signal_filters import zero_phase_effort_filter
 
 _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 

@@ -9,10 +9,13 @@ from collections.abc import Collection, Mapping
 from importlib import import_module
 from pkgutil import iter_modules
 
+import casadi as ca
+
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
-from yid_ocp.errors import ModelError, require_known_names, unknown_name_error_arguments
+from yid_ocp.errors import ConfigError, ModelError, require_known_names, unknown_name_error_arguments
+from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import System
 
 # kinds of recorded signals on which candidates depend; `nominal_clock` means times computed as sample index x period
@@ -30,13 +33,35 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     may be given as `stiffness`. Raises `ConfigError` for an unknown kind or parameter or a value outside its bounds,
     and `ModelError` if the kind cannot act at this location of the system.
     """
-    places = EFFECTS[kind].possible_locations(system)
+    cls, label = EFFECTS[kind], f"{kind}@{location}"
+    places = cls.possible_locations(system)
     # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
-    if location not in places and not (EFFECTS[kind].is_at_point_groups and location.partition("_")[0] == "points"):
+    if location not in places and not (cls.is_at_point_groups and location.partition("_")[0] == "points"):
         said = {"allowed": "no location of this model", "hint": "remove the effect from model.effects"}
         said = unknown_name_error_arguments(location, places) if places else said
-        raise ModelError(f"the effect {kind} is not possible at '{location}'", where=f"{kind}@{location}", **said)
-    return base.make_effect_unchecked(kind, location, system, values or {})
+        raise ModelError(f"the effect {kind} is not possible at '{location}'", where=label, **said)
+    definitions = cls.parameter_definitions(location, system)
+    names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
+    given, values = dict[str, float](), values or {}
+    require_known_names(values, names, "parameter", label, ConfigError)
+    for name, value in values.items():
+        definition = names[name]
+        if name != definition.name:
+            signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
+            if not (value > 0 or (signed and value < 0)):
+                allowed = f"{'a number other than zero' if signed else 'a positive number'} [{unit}]"
+                what, hint = f"{name} is {value}, but must be {allowed}", "correct the value, or leave it out"
+                raise ConfigError(what, where=label, allowed=allowed, hint=hint)
+            value = definition.internal_from_reported_value(value)
+        given[definition.name] = float(value)
+    entries = (
+        Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
+        for q in definitions
+    )
+    inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
+    internal = {name: ca.SX.sym(name) for name in inner}
+    arm_joints = base.joint_names_by_arm(system).get(location, ())
+    return cls(kind, location, Parameters(entries), internal, definitions, arm_joints)
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:

@@ -10,10 +10,10 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from yid_ocp.errors import ConfigError, require_known_names
+from yid_ocp.arrays import Array
 from yid_ocp.model.flexible import ElasticJoint
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
-from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
@@ -175,32 +175,6 @@ class EffectBase(Effect):
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
-def make_effect_unchecked(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
-    """Create an effect of a registered kind at a location that `make_effect` has already checked."""
-    cls, label = EFFECTS[kind], f"{kind}@{location}"
-    definitions = cls.parameter_definitions(location, system)
-    names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
-    given: dict[str, float] = {}
-    require_known_names(values, names, "parameter", label, ConfigError)
-    for name, value in values.items():
-        definition = names[name]
-        if name != definition.name:
-            signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
-            if not (value > 0 or (signed and value < 0)):
-                allowed = f"{'a number other than zero' if signed else 'a positive number'} [{unit}]"
-                what, hint = f"{name} is {value}, but must be {allowed}", "correct the value, or leave it out"
-                raise ConfigError(what, where=label, allowed=allowed, hint=hint)
-            value = definition.internal_from_reported_value(value)
-        given[definition.name] = float(value)
-    entries = (
-        Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral_value), q.unit, q.lower, q.upper, q.description)
-        for q in definitions
-    )
-    inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
-    internal = {name: ca.SX.sym(name) for name in inner}
-    return cls(kind, location, Parameters(entries), internal, definitions, joint_names_by_arm(system).get(location, ()))
-
-
 def flexible_segment_names(system: System) -> tuple[str, ...]:
     """Return the names of the object's flexible segments, such as the branches of a cable."""
     return tuple(segment.name for segment in system.segment_layouts)
@@ -280,13 +254,12 @@ def frame_names_at_arm_link_ends(system: System) -> tuple[str, ...]:
     """Return the names of frames at the ends of the arm links, without fixed frames and without coincident ones."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
-    if not own:
-        return ()
     # the frame of a link is at the end of the previous link
     first = {f.joint_index: name for name, f in list(tree.frames.items())[::-1] if f.joint_index in own}
     names = (*_arm_tip_frames(system), *(first[joint] for joint in sorted(first)))
     held = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    paths = _paths(system, (*names, *held))
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (3, system.n_coordinates))
+    paths = dict(zip((*names, *held), frame_positions(system, {}, (*names, *held), q).swapaxes(0, 1), strict=True))
     known = [path for name, path in paths.items() if name in held]
     found = []
     for name in dict.fromkeys(names):
@@ -316,14 +289,12 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Positions of frames in some random configurations, shape (configurations, 3) each [m]."""
-    q, kinematics = system.symbols_and_kinematics
-    places = ca.horzcat(*(kinematics.frame_position(name) for name in names))
-    function = ca.Function("places", [q, system.parameters.symbols], [places])
-    rng, theta = np.random.default_rng(0), system.parameters.vector()
-    at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, system.n_coordinates), theta))) for _ in range(3)]
-    return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
+def frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
+    """Compute the positions (N, nf, 3) [m] of frames at the configurations `q` (N, n), with parameter `values`."""
+    symbol = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
+    at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
+    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:

@@ -25,9 +25,8 @@ from yid_ocp.problem.measurements import SensorMeasurements, whiten_with_extra_e
 from yid_ocp.problem.options import ExcessResidualCriteria, SensorOptions
 from yid_ocp.problem.predictions import held_out_rmse_and_unit_by_channel
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
-from yid_ocp.sensors.base import ZeroPhaseFilterInterface
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, NOISE_ESTIMATE_DIFFERENCE_ORDER, joint_angle_noise_std
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
@@ -43,7 +42,6 @@ class OutputResidualIndices:
     recording: str
     channel: str
     group: str
-    unit: str
     t: Array  # since the recording's start, shape (M,) [s]
     residual_indices: IntArray  # shape (M,)
     noise_autocorrelation: Array  # at lags 0 to L samples, shape (L + 1,)
@@ -388,7 +386,7 @@ def channels_with_residual_indices(problem: EstimationProblem) -> tuple[OutputRe
             for column, channel in enumerate(samples.channel_name_per_output):
                 seen = samples.positive_weight_mask[:, column]
                 if seen.any():
-                    text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
+                    text = (episode.name, channel, samples.sensor.group_name)
                     series.append(OutputResidualIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
@@ -415,7 +413,7 @@ def newey_west_covariance_of_scores(columns: Array, residual: Array, series: Seq
     return total
 
 
-def _noise_autocorrelation(low_pass: ZeroPhaseFilterInterface | None, step: float, nodes: IntArray) -> Array:
+def _noise_autocorrelation(low_pass: ZeroPhaseLowPassFilter | None, step: float, nodes: IntArray) -> Array:
     """Autocorrelation, at lags 0, 1, ... samples, of white noise that was filtered every `step` [s], at some nodes."""
     if low_pass is None or not np.isfinite(low_pass.cutoff) or len(nodes) < 2:
         return np.ones(1)

@@ -28,8 +28,8 @@ from yid_ocp.planning import joint_paths
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import SensorMeasurements
-from yid_ocp.problem.signal_filters import zero_phase_effort_filter
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
+from yid_ocp.sensors.signal_filters import zero_phase_effort_filter
 
 _PLANNED_RECORDING_NAME = "planned"
 _MIN_POINT_RATE = 20.0  # lowest rate at which the information of a slow sensor is spread over the motion [Hz]

@@ -31,7 +31,7 @@ from yid_ocp.problem.model_functions import (
 )
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.recorded_inputs import step_mean_input_delay_derivative, step_mean_inputs
-from yid_ocp.problem.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter, slow_effort_filter
+from yid_ocp.sensors.signal_filters import FirstOrderLag, NodeValueSmoother, ZeroPhaseLowPassFilter, slow_effort_filter
 
 # largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**26

@@ -36,9 +36,9 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles_at_nodes,
     step_mean_inputs,
 )
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter, slow_effort_filter, zero_phase_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors import joints as joint_sensors
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter, slow_effort_filter, zero_phase_effort_filter
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _recorded_input_errors(
     position = sensors.get(joint_sensors.JOINT_POSITION_GROUP_NAME, SensorOptions())
     std = joint_sensors.joint_torque_noise_std(joints, driven, effort, recording.name)
     bias = joint_sensors.joint_torque_bias_std(joints, driven, effort)
-    encoders = any(entry.sensor.position_joints for entry in samples)
+    encoders = any(isinstance(entry.sensor, joint_sensors.PositionSensor) for entry in samples)
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
     angle = joint_sensors.joint_angle_noise_std(joints, driven, position, recording.name)

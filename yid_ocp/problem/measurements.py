@@ -17,7 +17,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
-from yid_ocp.sensors.base import ZeroPhaseFilterInterface
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _MAX_STEPS = 200_000  # half an hour in steps of 10 ms; exceeded by a clock in milliseconds or with jumps
 _MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as seconds needs a thousand
@@ -94,7 +94,7 @@ class SensorMeasurements:
     bias_std: Array  # standard deviation of a constant error of every output, or zero, (k,)
     noise_correlation: Array | None = None  # noise correlation of a sample's outputs, if not independent, (M, k, k)
     change_by_clock: Array | None = None  # change of the outputs by one std of the clock offset, (M, k)
-    smoothing_filter: ZeroPhaseFilterInterface | None = None  # of the values, if their noise is autocorrelated by it
+    smoothing_filter: ZeroPhaseLowPassFilter | None = None  # of the values, if their noise is autocorrelated by it
 
     @property
     def output_changes_per_bias_and_clock_std(self) -> Array:

@@ -17,9 +17,9 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import FirstOrderLag
 from yid_ocp.sensors import joints as joint_sensors
 from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
+from yid_ocp.sensors.signal_filters import FirstOrderLag
 
 _GIVEN_FRAMES = 2  # number of measured frames that predictions without a model use, like the fit of the initial state
 

@@ -19,10 +19,10 @@ from yid_ocp.model.objects.base import ClampPosePointNames
 from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX, MOTOR_OFF_COMMAND, PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, camera_pose_of_point_group, recorded_joint_column_indices
 from yid_ocp.sensors.base import channel_specs_for_group_name
 from yid_ocp.sensors.joints import is_point_group_measured_by_arm
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _MAX_LOST = 5  # samples in a row that are taken to lie on a straight line; across longer gaps a torque is held
 _MIN_PATH_CUTOFF, _MAX_CUTOFF_OVER_RATE = 10.0, 0.2  # [Hz], and as a fraction of the sample rate

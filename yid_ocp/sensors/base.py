@@ -18,6 +18,7 @@ from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols, System
 from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 EffortSamplingKind = Literal["sample", "mean", "command"]
 """Meaning of a recorded effort: the sampled torque, its mean until the next sample, or a command held until then."""
@@ -255,11 +256,6 @@ class Sensor(ABC):
         return np.ones(len(self.effort_joints))
 
     @property
-    def position_joints(self) -> tuple[str, ...]:
-        """The names of the driven joints whose encoders the sensor reads; empty for other sensors."""
-        return ()
-
-    @property
     def camera_pose(self) -> Placement | None:
         """The pose of the camera in the world. None if the sensor is not a camera."""
         return None
@@ -304,21 +300,6 @@ def sensor_function_with_jacobians(system: System, sensor: Sensor, names: tuple[
     return ca.Function("sensor", inputs, ca.cse(outputs), names_in, ["y", *(f"by_{name}" for name in names_in)])
 
 
-class ZeroPhaseFilterInterface(Protocol):
-    """A zero-phase low-pass filter, as in `problem.signal_filters.ZeroPhaseLowPassFilter`."""
-
-    @property
-    def cutoff(self) -> float: ...
-    @property
-    def passes(self) -> int: ...
-    @property
-    def end_distortion_duration(self) -> float: ...
-
-    def __call__(self, t: Array, values: Array) -> Array: ...
-    def decorrelation_stride_for_step(self, step: float) -> int: ...
-    def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]: ...
-
-
 @dataclass(frozen=True)
 class SensorDataInputs:
     """The system, recording, options, nodes and filters from which a sensor's measurements are computed.
@@ -332,8 +313,8 @@ class SensorDataInputs:
     node_times: Array  # times of the rollout's nodes, shape (N + 1,) [s]
     time_step: float  # distance of the nodes [s]
     sampling_stride: int  # number of steps between nodes at which filtered signals can be sampled
-    effort_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' efforts
-    path_filter: ZeroPhaseFilterInterface  # filter of prescribed joints' motion
+    effort_filter: ZeroPhaseLowPassFilter  # filter of prescribed joints' efforts
+    path_filter: ZeroPhaseLowPassFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
     has_uncertain_clocks: bool = False  # of point groups, if the settings do not specify it
     # by joint: speed [rad/s or m/s] below which a friction that is estimated can hold it with any torque up to its size
@@ -352,7 +333,7 @@ class SensorData:
     bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
     noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
     change_by_clock: Array | None = None  # change of the outputs by one std of the recording's clock offset, (M, k)
-    smoothing_filter: ZeroPhaseFilterInterface | None = None  # of the values, if their noise is autocorrelated by it
+    smoothing_filter: ZeroPhaseLowPassFilter | None = None  # of the values, if their noise is autocorrelated by it
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")

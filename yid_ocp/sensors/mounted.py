@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -19,8 +18,6 @@ from yid_ocp.sensors.joints import (
     is_noise_std_stated,
     joint_angle_noise_std,
 )
-
-_Kind = TypeVar("_Kind", bound="MountedSensor")
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class MountedSensor(base.Sensor):
         raise NotImplementedError
 
 
-def register_class_of_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
+def register_class_of_mounted_sensor(kind: type[MountedSensor]) -> type[MountedSensor]:
     """Register the channel of a class of mounted sensors, and a reader that makes one `SensorData` for each group."""
     key = f"{kind.channel.group}.{kind.channel.quantity}"
     base.CHANNEL_KINDS.register(key)(kind.channel)

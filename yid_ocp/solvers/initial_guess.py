@@ -20,7 +20,7 @@ from yid_ocp.integrator.tracking_feedback import lqr_tracking_feedback
 from yid_ocp.problem.episodes import Episode, InitialStateWithSensitivity
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 log = logging.getLogger(__name__)
 

@@ -24,8 +24,8 @@ from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_inform
 from yid_ocp.planning.motion_plan import ParameterCovarianceBeforePlan, TargetMotionPlan
 from yid_ocp.problem.measurements import rollout_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_coordinates_at_nodes, select_path_cutoff
-from yid_ocp.problem.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 from yid_ocp.workflow.build import build_step, build_system, cable_vertices_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandOutcome, make_command_function
