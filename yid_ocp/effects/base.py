@@ -12,7 +12,6 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.model.flexible import ElasticJoint
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
@@ -291,10 +290,11 @@ def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
 
 def frame_positions(system: System, values: Mapping[str, float], frames: Sequence[str], q: Array) -> Array:
     """Compute the positions (N, nf, 3) [m] of frames at the configurations `q` (N, n), with parameter `values`."""
-    symbol = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism_with_values(values), symbol)
+    symbol, kinematics = system.symbols_and_kinematics
     at = ca.vertcat(ca.SX(0, 1), *(kinematics.frame_position(name) for name in frames))
-    return np.array(ca.Function("at", [symbol], [ca.densify(at)]).map(len(q))(q.T)).T.reshape(len(q), len(frames), 3)
+    function = ca.Function("at", [symbol, system.parameters.symbols], [ca.densify(at)])
+    theta = system.parameters.vector(values)
+    return np.array([function(row, theta) for row in q]).reshape(len(q), len(frames), 3)
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
