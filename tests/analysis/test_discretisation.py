@@ -26,6 +26,7 @@ from yid_ocp.analysis.discretisation import (
 )
 from yid_ocp.analysis.estimation import add_intervals_and_checks
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
@@ -191,7 +192,9 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     finer = fit_problem(fine, GaussNewton(), initial_unknowns=found.x)
     own, *_ = _gauss_newton_step_in_finer_model(_FinerModel(fine), coarse, found.x, found.evaluation)
     # without segments there are no links to divide
-    told, notes = parameter_shifts_at_finer_discretisation(coarse, found.x, found.evaluation, ("links", "time_step"))
+    told, notes = parameter_shifts_at_finer_discretisation(
+        coarse, found.x, found.evaluation, ("links", "time_step"), NULL_PROGRESS
+    )
     assert notes == []
     assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
     assert {entry.links for entry in told.values()} == {None}

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -197,7 +198,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_each_from_the_others_and_shows
 
     solution = fit_problem(driven, GaussNewton(), restarts=False)
     monkeypatch.setattr(GaussNewton, "minimize_cost", searched)
-    fit = cross_validate_law_by_motion_kind("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    fit = cross_validate_law_by_motion_kind("coulomb", driven, solution, recording_names_by_name_stem(driven), Mock())
     names = {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert folds == [(names - own, own) for own in ({"slow_1", "slow_2"}, {"fast_1"}, {"turn_1"})]
     assert (set(fit.left_out_errors), fit.unit) == (names, "rad")
@@ -224,7 +225,7 @@ def test_laws_of_an_arm_that_moves_as_measured_are_judged_by_its_efforts(urdf_fo
         far = seen(["tip"], t, np.full((201, 1, 3), 9.0), std=np.full((201, 1, 3), 1e-3))
         made.append(recording(moved, far, name=f"run {seed}"))
     problem, kinds = EstimationProblem(step, made, [law]), {"one": ("run 0",), "other": ("run 1",)}
-    fit = cross_validate_law_by_motion_kind("coulomb", problem, fit_problem(problem, restarts=False), kinds)
+    fit = cross_validate_law_by_motion_kind("coulomb", problem, fit_problem(problem, restarts=False), kinds, Mock())
     assert (fit.unit, fit.left_out_errors) == ("std", pytest.approx({"run 0": 1.1, "run 1": 1.1}, abs=0.2))
 
 

@@ -14,7 +14,7 @@ import scipy.optimize
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
-from yid_ocp.display import NULL_PROGRESS, Progress, abbreviated_names_text
+from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
@@ -349,11 +349,7 @@ def finer_settings(problem: EstimationProblem) -> dict[str, list[str]]:
 
 
 def parameter_shifts_at_finer_discretisation(
-    problem: EstimationProblem,
-    x: Array,
-    at_x: Evaluation,
-    kinds: Sequence[RefinementKind],
-    progress: Progress = NULL_PROGRESS,
+    problem: EstimationProblem, x: Array, at_x: Evaluation, kinds: Sequence[RefinementKind], progress: Progress
 ) -> tuple[dict[str, EstimateShiftByDiscretisation], list[str]]:
     """Compute how much estimates change with twice the links, half the time step, and more noise of encoders.
 

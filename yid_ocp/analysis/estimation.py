@@ -18,7 +18,6 @@ from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun, grouped
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
@@ -184,10 +183,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
 def choose_fit_with_or_without_shape_memory(
-    problem: EstimationProblem,
-    solver: Solver,
-    solution: Solution,
-    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    problem: EstimationProblem, solver: Solver, solution: Solution, limits: ExcessResidualCriteria
 ) -> tuple[EstimationProblem, Solution, str]:
     """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 

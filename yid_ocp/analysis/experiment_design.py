@@ -28,7 +28,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.sensors import PositionSensor, camera_pose_of_point_group
+from yid_ocp.sensors import camera_pose_of_point_group
 from yid_ocp.sensors.base import missing_noise_level_error
 from yid_ocp.sensors.joints import JOINT_EFFORT_SENSOR_KEY, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
@@ -309,7 +309,7 @@ class ExperimentVariantSensitivityBuilder:
     def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
         """Return the problem with encoder readings of driven joints, or None if the recorded experiment has none."""
         base = self.setting.problem
-        used = any(isinstance(own.sensor, PositionSensor) for e in base.episodes for own in e.measurements)
+        used = any(samples.sensor.position_joints for e in base.episodes for samples in e.measurements)
         if not used or not problem.system.driven:
             return None
         sensors = dict(problem.options.sensors)

@@ -59,7 +59,7 @@ def cross_validate_law_by_motion_kind(
     problem: EstimationProblem,
     solution: Solution,
     kinds: Mapping[str, Sequence[str]],
-    parts: PartsDoneCounter | None = None,
+    parts: PartsDoneCounter,
 ) -> CrossValidatedFrictionLawFit:
     """Fit a friction law without each of the `kinds` of motion in turn, and compute its errors on the omitted kind."""
     errors: dict[str, float] = {}
@@ -86,9 +86,8 @@ def cross_validate_law_by_motion_kind(
             else:
                 rows = np.vstack([p.predicted_minus_measured for p in channel_predictions(own_episode, outcome)])
             errors[episode.name] = float(np.sqrt(np.nanmean(rows**2)))
-        if parts is not None:
-            error = np.mean([errors[name] for name in own if name in errors])
-            parts.count_done(f"law '{law}' fitted to the other motions: rms error on {kind} {error:.3g} {unit}")
+        error = np.mean([errors[name] for name in own if name in errors])
+        parts.count_done(f"law '{law}' fitted to the other motions: rms error on {kind} {error:.3g} {unit}")
     return CrossValidatedFrictionLawFit(law, errors, unit, solution.status.value == "converged")
 
 

@@ -22,7 +22,6 @@ from yid_ocp.integrator.tracking_feedback import applied_torque_derivative_by_to
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import TorqueAndAngleErrorModel
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.sensors import PositionSensor
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation of a reading that may be neglected, in units of its noise
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512  # random samples of all errors, doubled while too few
@@ -99,7 +98,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     if not evaluation.ok or evaluation.jacobian is None:
         raise failed_rollout_error(evaluation.message, "the experiment with measured angles of driven joints")
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
-        if isinstance(samples.sensor, PositionSensor):
+        if samples.sensor.position_joints:
             read = samples.interpolate_to_samples(blur[samples.evaluation_node_indices])
             own = samples.residual_and_jacobian(np.zeros(samples.value.shape), read).jacobian
             assert own is not None

@@ -143,7 +143,7 @@ def _recorded_input_errors(
     position = sensors.get(joint_sensors.JOINT_POSITION_GROUP_NAME, SensorOptions())
     std = joint_sensors.joint_torque_noise_std(joints, driven, effort, recording.name)
     bias = joint_sensors.joint_torque_bias_std(joints, driven, effort)
-    encoders = any(isinstance(entry.sensor, joint_sensors.PositionSensor) for entry in samples)
+    encoders = any(entry.sensor.position_joints for entry in samples)
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
     angle = joint_sensors.joint_angle_noise_std(joints, driven, position, recording.name)

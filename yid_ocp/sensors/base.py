@@ -256,6 +256,11 @@ class Sensor(ABC):
         return np.ones(len(self.effort_joints))
 
     @property
+    def position_joints(self) -> tuple[str, ...]:
+        """The names of the driven joints whose encoders the sensor reads; empty for other sensors."""
+        return ()
+
+    @property
     def camera_pose(self) -> Placement | None:
         """The pose of the camera in the world. None if the sensor is not a camera."""
         return None

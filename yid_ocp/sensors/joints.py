@@ -63,6 +63,10 @@ class PositionSensor(JointSensor):
     has_paper_weight = False
     group_name: str = JOINT_POSITION_GROUP_NAME
 
+    @property
+    def position_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
     def ideal_reading(self, state: NodeStateSymbols) -> ca.SX:
         return self.select_sensor_joint_entries(state.q, state)
 
