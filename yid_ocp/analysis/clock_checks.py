@@ -50,6 +50,8 @@ _N_RELINEARIZATIONS = 3  # repetitions of a fit at the corrected times
 _MAX_CLOCK_SHIFT_Z = 2.0  # stated standard deviations by which a clock may be off without an issue
 _MAX_CLOCK_RESIDUE = 0.5  # rms error of a corrected path per noise, which adds a quarter to chi2 per degree of freedom
 _MIN_EXPLAINED_FRACTION = 0.5  # fraction of the residual beyond noise that a drift must explain
+# Of the residual of a fit: a longer delay is beyond the linear model, which makes a drift of it.
+_MIN_DRIFT_PER_DELAY = 0.5
 # Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
@@ -315,7 +317,9 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
             error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
             limit = _offset_tolerance(joints, group)
-            if error is not None and error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION:
+            if error is None or abs(error.whole_drift) < _MIN_DRIFT_PER_DELAY * abs(error.delay):
+                continue
+            if error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION:
                 yield _drift_issue(error, group.name, limit, "not_trusted")
 
 

@@ -350,7 +350,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         shifted = earlier.shifted_parameters_with_prior(nominal, limits)
         evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
         judged = judge(search, evidence)
-        if search.is_skipped_past_deadline():  # a search that begins anew would find nothing
+        # a search that begins anew would find nothing
+        if search.is_skipped_past_deadline(*(f"a change of {name} since the baseline" for name in shifted)):
             break
         seen, judged = _with_changed_parameters(seen, judged, earlier)
         if seen is before:

@@ -399,7 +399,7 @@ def refit_with_each_effect(
     merged = partial(map_with_merged_calls, questions_per_item=search.n_batched)
     at_once = merged if search.n_batched else map_in_threads
     for i in range(0, len(tried), size):
-        if search.is_skipped_past_deadline(*(join_effect_labels(effects) for effects, _ in tried[i:])):
+        if search.is_skipped_past_deadline(*(f"{join_effect_labels(own)} {where}".strip() for own, _ in tried[i:])):
             break
         fits += at_once(one, tried[i : i + size])
     return [fit for fit in filter(None, fits) if math.isfinite(fit.held_out_loss.total_chi2)]

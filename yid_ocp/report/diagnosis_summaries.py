@@ -44,7 +44,7 @@ from yid_ocp.report.terminal import (
 
 _MAX_FORECASTS = 5  # largest number of listed candidates that were not fitted; result.json has all
 _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
-_FOUND_VERDICTS = ("identifiable", "weak", None)
+_FOUND_VERDICTS = ("identifiable", "weak")
 """Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
@@ -395,12 +395,6 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 @SUMMARIES.register("yid-friction/1")
 def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unit, best = result["unit"], result["warranted"]
-    heads = ("error", "standard error", f"difference from '{best}'", "standard error of the difference", "note")
-    rows: TableRows = [("law", *heads)]
-    keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
-    for law, entry in result["laws"].items():
-        note = ("chosen" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
-        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), note))
     chosen = result["laws"][best]
     fitted, friction, error = chosen["parameters"], result["friction_parameters"], f"{chosen['mean_error']:.3g} {unit}"
     joints, kinds = abbreviated_names_text(result["joints"]), ", ".join(result["kinds"])
@@ -408,17 +402,23 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     told = {n: (e["value"], e["std"], e["interval"]) for n, e in fitted.items()}
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
-    text = f"Use the law '{best}' for these joints: {joints}. Its"
-    if lost:
-        text = f"The law '{best}' predicts best, but first record motions that determine {lost} ({joints}). Its"
     is_absent = bool(friction) and all(shown[name] == "–" for name in friction)
+    heads = ("error", "standard error", f"difference from '{best}'", "standard error of the difference", "note")
+    rows: TableRows = [("law", *heads)]
+    keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
+    for law, entry in result["laws"].items():
+        note = "chosen" * (law == best and not is_absent) + " (the fit did not converge)" * (not entry["converged"])
+        rows.append((law, *(f"{entry[key]:.3g}" for key in keys), note))
+    errors = f"held-out error {error}, worst law {worst:.3g}{noise}"
+    text = f"Use the law '{best}' for these joints: {joints}. No simpler law predicts as well ({errors})."
+    if lost:
+        text = f"No law simpler than '{best}' predicts as well ({errors}), but its constants cannot be used yet: first "
+        text += f"record motions that determine {lost} ({joints})."
     if not chosen["converged"]:
-        text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge. Its"
+        text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge."
     elif is_absent:
-        text = f"Use no friction law, because these recordings do not show friction of {joints}. Of '{best}', the"
-    text += f" held-out error is {error} (worst law: {worst:.3g}{noise}). No simpler law predicts as well, apart from "
-    text += f"chance. Each motion was held out in turn: {kinds}."
-    yield SummaryStatement(text, "conclusion")
+        text = f"Use no friction law, because these recordings do not show friction of {joints}."
+    yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
     if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
         yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
     symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}

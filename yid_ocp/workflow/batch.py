@@ -7,6 +7,7 @@ import glob
 import itertools
 import json
 import logging
+import math
 import shlex
 import shutil
 import time
@@ -21,6 +22,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.display import NULL_PROGRESS, Progress, effect_entry_label
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_file_question
 from yid_ocp.files import file_sha256, folder_error, to_json_types, write_strict_json
+from yid_ocp.inference.uncertainty import verdict_by_relative_std
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
@@ -170,6 +172,9 @@ def _run_batch_task(
         status, ok, message = result["status"], result["status"] == "converged", result["message"]
     free = {parameter: own for parameter, own in judged.items() if own.get("free", True)}
     parameters = {parameter: {key: own.get(key) for key in _PARAMETER_KEYS} for parameter, own in free.items()}
+    for own in parameters.values():  # a diagnosis does not judge them
+        std = math.inf if own["std"] is None else own["std"]
+        own["verdict"] = own["verdict"] or verdict_by_relative_std(own["value"], std, abs(own["value"]))
     effects = [effect_entry_label(entry) for entry in result.get("effects", ())]
     found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
     found["explains"] = fit.get("explains")
