@@ -50,8 +50,8 @@ _N_RELINEARIZATIONS = 3  # repetitions of a fit at the corrected times
 _MAX_CLOCK_SHIFT_Z = 2.0  # stated standard deviations by which a clock may be off without an issue
 _MAX_CLOCK_RESIDUE = 0.5  # rms error of a corrected path per noise, which adds a quarter to chi2 per degree of freedom
 _MIN_EXPLAINED_FRACTION = 0.5  # fraction of the residual beyond noise that a drift must explain
-# Of the residual of a fit: a longer delay is beyond the linear model, which makes a drift of it.
-_MIN_DRIFT_PER_DELAY = 0.5
+# For the residual of a fit: a longer delay is beyond the linear model, in which it seems to be a drift as well.
+_MAX_DELAY_PER_DRIFT = 2.0
 # Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not be attributed to a clock.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
 
@@ -317,9 +317,14 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             jacobian = evaluation.jacobian[own] * problem.unknown_scales
             error = _clock_error(t, evaluation.residual[own], columns[:, 1:], jacobian, size, span)
             limit = _offset_tolerance(joints, group)
-            if error is None or abs(error.whole_drift) < _MIN_DRIFT_PER_DELAY * abs(error.delay):
+            if error is None or not (error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION):
                 continue
-            if error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION:
+            if abs(late := error.delay) > _MAX_DELAY_PER_DRIFT * abs(error.whole_drift):
+                side = "late" if late > 0 else "early"
+                words = f"time stamps of {group.name} are about {1e3 * abs(late):.3g} ms {side} on the joints' clock"
+                advice = f"add {-late:+.3g} s to their times, and repeat this command"
+                yield Issue("clock_offset", words, "not_trusted", abs(late) / limit, advice, "", group.name, "t")
+            else:
                 yield _drift_issue(error, group.name, limit, "not_trusted")
 
 
