@@ -136,6 +136,8 @@ def _words(hint: Any) -> str:
         if names := [name for own in choices for name in own.registry]:
             return f"a section, such as {{{names[0]}: {{}}}}, with names among {', '.join(names)}"
         value = _words(mapping_value_type(bare))
+        if value == "a section":
+            value = f"a section, such as {{{next(iter(class_options_by_key(mapping_value_type(bare))))}: VALUE}}"
         return f"a section that has for each name {value}"
     entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
     needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
@@ -153,9 +155,9 @@ def check_option_bounds(options: Any, where: str) -> None:
 
 
 def default_value_hint(key: str, option: Option) -> str:
-    """Return the advice to set an option to an allowed value, or to its default or leave it out if it has one."""
+    """Return the advice to set an option to an allowed value, or to its default if it has one."""
     default, about = option.default_value, split_annotated(option.type_hint)[1]
-    said = f"write an allowed value for {key}" + ", or leave it out" * (default is not MISSING)
+    said = f"write an allowed value for {key}"
     if isinstance(default, (int, float, str)) or (default and isinstance(default, tuple)):
         shown = default if isinstance(default, str) else json.dumps(default)
         said = f"write {key}: {shown} (the default), or another allowed value"

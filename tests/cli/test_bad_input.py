@@ -61,6 +61,7 @@ def edited(file, old, new):
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("upper bound of 0.5 N", "at most 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("upper bound of 100 N", "at most 100 N m/rad")),
         ("shoulder.stiffness:", "sholder.stiffness:", ("no parameter", "did you mean 'shoulder.stiffness'?")),
+        ("shoulder.stiffness:", "*.stiffness:", ("quote patterns, such as '*.stiffness'",)),
         ("    shoulder: {stiff", "    sholder: {stiff", ("there is no joint 'sholder'", "did you mean 'shoulder'?")),
         ("mode: prescribed", "mode: prescribed, joints: [sholder]", ("sholder", "did you mean 'shoulder'?")),
         ("mode: prescribed", "mode: prescribed, locked_joints: {albow: 1}", ("albow", "did you mean 'elbow'?")),

@@ -402,8 +402,8 @@ def test_read_any_chooses_by_suffix(tmp_path: Path) -> None:
 
 
 def test_read_any_refuses_what_it_does_not_know(tmp_path: Path) -> None:
-    error = refused(tmp_path / "run.csvv", r"no reader for '\.csvv'")
-    assert (error.hint, ".mcap" in error.allowed) == ("did you mean '.csv'?", True)
+    error = refused(table(tmp_path, "", "run.mat"), r"no reader for '\.mat'")
+    assert ("export CSV" in error.hint, ".mcap" in error.allowed) == (True, True)
     assert refused(table(tmp_path, "t,q_a\n0,1\n"), "no option 'unit'", unit={}).hint == "did you mean 'units'?"
 
 

@@ -95,7 +95,7 @@ BAD: dict[str, tuple[str, str | None, str, str]] = {
     "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "unit of current"),
     "a constant without efforts": ("run.csv", GOOD, "--torque-constants a=1", "the file has no efforts"),
     "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "--joint-topic does not apply"),
-    "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),
+    "a long delimiter": ("run.csv", GOOD, "--delimiter tab", "the delimiter is 'tab'"),
     "a section that is none": ("run.csv", GOOD, "--config wrong.yaml", "there is no key 'colums'"),
 }  # fmt: skip
 

@@ -44,6 +44,7 @@ _YAML_FAULTS = {  # what the parser says: in plain words, and the cure
     "found '<scalar>'": ("text after a closing quote or bracket, or no key", "write KEY: 'a \"quoted\" word'"),
     "expected <block end>": ("its indentation differs from that of the lines above", "indent it like its section"),
     "mapping values are not allowed": ("a second colon, or an indentation too deep", "align keys, one in each line"),
+    "found undefined alias": ("a * at the beginning, without quotes", "quote patterns, such as '*.stiffness'"),
     "cannot start any token": ("a tab, or a character that needs quotes", "indent by spaces, and quote such text"),
     "could not find expected ':'": ("a key without a colon", "write KEY: VALUE, with a space after the colon"),
 }
@@ -81,6 +82,8 @@ def _read(path: Path) -> str:
         return read_input_text(path, _MAX_BYTES)
     except DataError as error:
         what, allowed, hint = error.what, "a YAML file in UTF-8 of at most 1 MiB", error.hint
+        if path.is_dir():
+            hint = f"use the path of a file, such as {min(path.glob('*.y*ml'), default=path / 'CONFIG.yaml')}"
         if isinstance(error.__cause__, FileNotFoundError):
             what, allowed = "there is no such configuration file", "the path of an existing YAML file"
             init = "correct the path, or write a configuration: yid-ocp init ROBOT RECORDING --out CONFIG.yaml"

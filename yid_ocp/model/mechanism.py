@@ -176,7 +176,8 @@ class Mechanism(ReprMixin):
         line, _, said = name.partition(":")
         if not self.has_frame(name):
             known = (*(f"{entry}:{said or '50%'}" for entry in self.link_chains), *self.frames)
-            choice = unknown_name_error_arguments(name, known, "use one of these frames, or add one to model.frames")
+            hint = "use one of these frames" + ", or add one to model.frames" * bool(where)
+            choice = unknown_name_error_arguments(name, known, hint)
             raise ModelError(f"there is no frame '{name}'", where=where or f"model '{self.name}'", **choice)
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]

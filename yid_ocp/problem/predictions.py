@@ -59,7 +59,7 @@ def _start_frame(recording: Recording, points: Sequence[str], t: Array) -> Array
     at, where = recording.point_positions(points, t), f"recording '{recording.name}'"
     if len(at) <= _GIVEN_FRAMES:
         what, allowed = f"{', '.join(points)} have {len(at)} samples only", f"{_GIVEN_FRAMES + 1} samples or more"
-        raise DataError(what, where=where, allowed=allowed, hint=f"use a longer recording instead of {recording.name}")
+        raise DataError(what, where=where, allowed=allowed, hint="use a longer recording or problem.duration")
     start = np.asarray(at[_GIVEN_FRAMES - 1])
     if not np.all(np.isfinite(start)):
         hidden = points[int(np.argmin(np.isfinite(start).all(axis=1)))]

@@ -176,7 +176,7 @@ def decorrelated_nodes_and_low_pass_values(
     if not len(kept):
         length, allowed = min(steps * step, float(t[-1] - t[0])), f"more than {2 * ends * step:.3g} s"
         what = f"{length:.3g} s of {key} are too short for the low-pass filter of {low_pass.cutoff:g} Hz"
-        hint = f"use a longer recording, raise problem.path_cutoff, or set sensors.{key}.use: false"
+        hint = f"use a longer recording or problem.duration, raise problem.path_cutoff, or set sensors.{key}.use: false"
         raise DataError(what, where=f"recording '{inputs.recording.name}'", allowed=allowed, hint=hint)
     smooth, late = low_pass(t, values), 0.5 * period if at_centres else 0.0
     return every * kept, np.stack([np.interp(times[kept], t + late, column) for column in smooth.T], axis=1)

@@ -83,9 +83,11 @@ class ZeroPhaseLowPassFilter:
         nyquist = 0.5 / step
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
-            allowed = f"0 (automatic), or above {least:.2g} and below {nyquist:g} Hz (half the rate of this recording)"
+            allowed = f"above {least:.2g} and below {nyquist:g} Hz (half the rate of these samples)"
             what = f"samples {step:.3g} s apart cannot be low-pass filtered at {self.cutoff:g} Hz"
-            hint = f"set problem.path_cutoff: 0, or a value below {nyquist:g} Hz, or else a smaller problem.time_step"
+            hint = f"set a problem.path_cutoff above {least:.2g} Hz"
+            if self.cutoff >= nyquist:
+                hint = f"set a problem.path_cutoff below {nyquist:g} Hz, or a smaller problem.time_step"
             raise DataError(what, where="problem.path_cutoff", allowed=allowed, hint=hint)
         warped = math.tan(math.pi / 2 * self.cutoff / nyquist)
         damping = 2 * warped * np.sin(np.pi / (2 * _FILTER_ORDER) * np.arange(1, _FILTER_ORDER, 2))

@@ -72,15 +72,14 @@ def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
 
 
 def _format_of(path: Path) -> str:
-    if not path.suffix and not path.exists():
-        check_input_file(path)
     key = path.suffix.lower()
     if path.is_dir():
         key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
     if key not in READERS:
+        if not path.exists():
+            check_input_file(path)
         what, hint = f"there is no reader for '{key}' files", "export CSV with columns t, q_JOINT, ..."
         if key in (".urdf", ".xml"):
             what, hint = "this is a robot, not a recording", f"give the robot to `init`: yid-ocp init {path} RECORDING"
-            key = ""
-        raise DataError(what, where=str(path), **unknown_name_error_arguments(key, READERS, hint))
+        raise DataError(what, where=str(path), allowed=", ".join(READERS), hint=hint)
     return key

@@ -238,8 +238,8 @@ _OR_SKIP = ", or skip such lines with --skip-bad-lines"
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every nonempty line."""
-    what, hint = f"the delimiter is {delimiter!r}, but must be one character", "set for example --delimiter ';'"
-    raise_data_error_unless(len(delimiter) == 1, what, str(path), "one character, such as , ; or tab", hint)
+    what, hint = f"the delimiter is {delimiter!r}, but must be one character", "leave --delimiter out, to detect it"
+    raise_data_error_unless(len(delimiter) == 1, what, str(path), "one character, such as ';' or $'\\t' (tab)", hint)
     try:
         with check_input_file(path).open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
