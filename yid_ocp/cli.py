@@ -306,9 +306,8 @@ class _Parser(argparse.ArgumentParser):
         chosen = re.fullmatch(r"argument (\S+): invalid choice: '?(.*?)'? \(choose from (.*)\)", message, re.DOTALL)
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
-            noun, hint = f"choice of {chosen[1]}", self._help()
-            if chosen[1] == "COMMAND":
-                noun, hint = "command", f"write the command first, then its options; {hint}"
+            noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
+            hint = "write the command first, then its options; " * (noun == "command") + self._help()
             details = unknown_name_error_arguments(chosen[2], known, hint)
             raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **details)
         where, allowed, hint = self.prog, self._usage(), self._help()

@@ -671,6 +671,7 @@ def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a
 def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
     (doubt,) = doubts(springs, drift=0.01)
     assert (doubt.cause, doubt.severity, doubt.group) == ("clock_drift", "not_trusted", "points_camera")
+    assert ("leave the points out" in doubt.advice, doubt.setting) == (False, "")  # the only sensor
     told, std = map(float, re.search(r"runs ([\d.]+) ± ([\d.]+) parts per thousand too fast", doubt.what).groups())
     assert told == pytest.approx(10.0, abs=4 * std + 0.5)
 

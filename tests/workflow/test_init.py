@@ -503,6 +503,8 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
     "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
     "other number": (("--object", "tapered_rod", "--number", "tip_radus=1"), "not a NAME=NUMBER of", "'tip_radius'?"),
     "number alone": (("--object", "tapered_rod", "--number", "tip_radius"), "not a NAME=NUMBER of", "tip_radius=0.1\n"),
+    "radius and section": ((*CABLE, "--section", "0.01,0.02"), "are both given", "leave --radius out"),
+    "grasp at the root": ((*CABLE, "--grasp", "hub=w_cable"), "'hub' holds the object's root and w_cable", "--holder"),
     "grasp of no point": ((*CABLE, "--grasp", "hub"), "is not FRAME=POINT", "FRAME=POINT"),
     "import flags of a recording": ((*CABLE, "--units", "deg"), "is a recording already", "give the original file"),
 }  # fmt: skip

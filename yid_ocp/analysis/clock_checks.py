@@ -165,14 +165,14 @@ def robot_held_point_clock_issues(
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
 
-def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSeverity) -> Issue:
+def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSeverity, can_omit: bool = True) -> Issue:
     late, drift, whole = found.delay, found.drift, found.whole_drift
     begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
     size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
     words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end "
     words += f"(a change by {1e3 * limit:.3g} ms is tolerated). Their clock runs {size} parts per thousand too {how}"
-    advice = f"{timestamp_correction_advice(late, drift, 0.5 * sum(found.span))}, or leave the points out"
-    setting = f"sensors.{group}.use: false"
+    advice = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)) + ", or leave the points out" * can_omit
+    setting = f"sensors.{group}.use: false" * can_omit
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
@@ -325,7 +325,7 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
                 advice = f"add {-late:+.3g} s to their times, and repeat this command"
                 yield Issue("clock_offset", words, "not_trusted", abs(late) / limit, advice, "", group.name, "t")
             else:
-                yield _drift_issue(error, group.name, limit, "not_trusted")
+                yield _drift_issue(error, group.name, limit, "not_trusted", len(episode.measurements) > 1)
 
 
 def _by_lateness(

@@ -275,7 +275,9 @@ def recording_summary_lines(recording: Recording) -> list[str]:
         sampled = str(len(group.t)), f"{rate:.4g}" if math.isfinite(rate) else "", f"{gap:.3g}", f"{span:.4g}"
         names = abbreviated_names_text(group.names, math.inf)
         rows.append((group.name, *sampled, ", ".join(_channels_with_units(group)), names))
-    return [*aligned_table_lines(rows), *_note_lines(recording.notes)]
+    missing = ((group.name, np.isnan(group.position).any(axis=2)) for group in recording.points)
+    said = (f"{lost.sum()} of {lost.size} readings of {name} are missing" for name, lost in missing if lost.any())
+    return [*aligned_table_lines(rows), *_note_lines([*recording.notes, *said])]
 
 
 def _channels_with_units(group: JointGroup | PointGroup | SensorChannelGroup) -> list[str]:

@@ -162,6 +162,9 @@ def propose_config_choices(
         holder = min(reversed([name for name, at in tree.frames.items() if at.joint_index >= 0]), key=_tool_rank)
     holder, own = _holder(tree, arms, holder, standing)
     held = dict(grasps or {})
+    if holder in held and not standing:
+        what, hint = f"'{holder}' holds the object's root and {held[holder]}", "leave one out, or give another --holder"
+        raise ConfigError(what, where="--grasp", allowed="a frame other than that of the root", hint=hint)
     if not held and standing:
         held = {arm.tool_frames[0]: end for arm, end in zip(arms, ("w_T2", "w_T3"), strict=False)}
     elif not held and branches:

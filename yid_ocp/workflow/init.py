@@ -120,6 +120,9 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         allowed, hint = f"a number above 0 [{unit}]", f"measure it, and write {flag}NUMBER"
         raise ConfigError(what, where=flag.strip(" ="), allowed=allowed, hint=hint)
     given = {**numbers, **{name: getattr(arguments, name) for name in ("section", "branch", "branches")}}
+    if given["radius"] and given["section"]:
+        what, hint = "--radius and --section are both given", "leave --radius out for a rectangular cross section"
+        raise ConfigError(what, where="--radius, --section", allowed="one of the two", hint=hint)
     if given["branch"] and not template.has_branches:
         what, hint = f"the object '{word}' has no branches", "write --object tree, or leave --branch out"
         raise ConfigError(what, where="--branch", allowed="--branch with --object tree", hint=hint)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,7 @@ def identified_parameters_with_covariance(
         values = {name: parameters[name].value for name in free_parameter_names(run, parameters)}
         return theta, ParameterCovarianceBeforePlan(), {"run": None, "parameters": values}
     result, folder = _read_parameter_run(run, ("solve",))
-    _require_same_effects(run, result["parameters"], parameters.names)
+    _require_same_model(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     theta[[parameters.index(name) for name in found]] = list(found.values())
     with open_hdf5_after_read_check(folder / "trajectories.h5") as data:
@@ -191,18 +191,21 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
     if run.plan.parameter_run_folder is not None:
         result, origin = _read_parameter_run(run, ("solve", "diagnose"))
         found, sizes = _parameter_and_effect_values(result)
-        _require_same_effects(run, found, known.names)
+        _require_same_model(run, result.get("parameters", result.get("absorption", {})), known.names)
         values |= {name: value for name, value in found.items() if name in known}
     with add_setting_location_to_errors(run, "plan"):
         plan = plan_informative_motion(problem, run.plan, values, sizes, progress)
     return plan, {"run": None if origin is None else str(origin), "parameters": values}
 
 
-def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
+def _require_same_model(run: RunSettings, found: Mapping[str, Mapping[str, Any]], own: Collection[str]) -> None:
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
-    if lacking:
-        what = f"the model of {run.plan.parameter_run_folder} has effects that this one lacks: {', '.join(lacking)}"
-        allowed, hint = "a run of `solve` on the same model", "list the same effects under model.effects"
+    free, folder = {name for name, entry in found.items() if entry.get("free", True)}, run.plan.parameter_run_folder
+    allowed, hint = "a run of `solve` on the same model", "list the same effects under model.effects"
+    what = f"the model of {folder} has effects that this one lacks: {', '.join(lacking)}" if lacking else ""
+    if not lacking and free and free.isdisjoint(own):
+        what, hint = f"{folder} estimated no parameter of this model", "give the run folder of another run"
+    if what:
         raise run.config_error(what, "plan", "parameter_run_folder", allowed=allowed, hint=hint)
 
 

@@ -328,9 +328,9 @@ def _have_same_recordings(folders: Sequence[Path]) -> bool:
 
 def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
     """Overlay two runs of the same recordings and write `overlay.json` and report.html."""
-    progress.begin_stage("overlaying the predictions of both runs")
     labels = [folder.name if folders[0].name != folders[1].name else str(folder) for folder in folders]
     results, roles = [read_estimation_result(folder, needs_minimum=True) for folder in folders], dict[str, list[str]]()
+    progress.begin_stage("overlaying the predictions of both runs")
     known = [_stored_predictions(folder, roles) for folder in folders]
     pairs = [(own, known[1][key]) for key, own in known[0].items() if key in known[1]]
     if not pairs:

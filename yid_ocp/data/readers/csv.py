@@ -185,7 +185,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
         n_lines += 1
         if len(cells) == len(names):
             numbers.extend(map(_number, cells))
-            blank.extend(not cell.strip() for cell in cells)
+            blank.extend(cell.strip().lower() in ("", "nan") for cell in cells)
     if head and not numbers:  # every row has more or fewer cells: the error of reading the first one
         _numbers(head[1], names, [None] * len(names), f"{path}, line {head[0]}")
     table = np.array(numbers).reshape(-1, len(names))
