@@ -421,7 +421,7 @@ def test_on_a_rod_that_was_straight_a_marker_is_placed_within_a_fraction_of_a_mi
 
 
 def test_arms_that_hold_both_ends_of_a_rod_move_as_measured(bench: Path) -> None:
-    system = build_system(proposed(moved(SHORT, effort=True), *CABLE, "--grasp", "hub=w_cable"))
+    system = build_system(proposed(moved(SHORT, effort=True), *CABLE, "--grasp", "fork=w_cable"))
     assert system.prescribed == ("roll", "pitch"), "the tracking filter needs arms that carry no object"
 
 
