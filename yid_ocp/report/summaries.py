@@ -77,9 +77,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         why = result["message"].partition(". Set solver.")[0] if is_hopeless else result["message"]
         said = f"Do not use the values, because {said}: {why.removesuffix('.')}."
         said += f" If a simulation failed, {FAILED_ROLLOUT_ADVICE}." * failed
-        said += (
-            f" With {chi2:.0f} times the chi2 of the stated noise, first check units, signs and names." * is_hopeless
-        )
+        if is_hopeless:
+            said += f" With {chi2:.0f} times the chi2 of the stated noise, first check units, signs and names."
         yield SummaryStatement(said, "conclusion")
     is_told = is_safe and any(entry["verdict"] == "identifiable" for entry in free.values())
     yield from issue_summary_blocks(result, with_verdict=not is_told) if is_trusted else ()
