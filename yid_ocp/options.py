@@ -135,13 +135,19 @@ def _words(hint: Any) -> str:
         choices = [own for own in split_annotated(mapping_value_type(bare))[1] if isinstance(own, RegistryChoice)]
         if names := [name for own in choices for name in own.registry]:
             return f"a section, such as {{{names[0]}: {{}}}}, with names among {', '.join(names)}"
-        value = _words(mapping_value_type(bare))
-        if value == "a section":
-            value = f"a section, such as {{{next(iter(class_options_by_key(mapping_value_type(bare))))}: VALUE}}"
-        return f"a section that has for each name {value}"
-    entries = class_options_by_key(bare).items() if isinstance(bare, type) and dataclasses.is_dataclass(bare) else ()
-    needed = ", ".join(f"{key}: {key.upper()}" for key, option in entries if option.default_value is MISSING)
-    return "a section" + f", such as {{{needed}}}" * bool(needed)
+        entry = mapping_value_type(bare)
+        is_section = isinstance(entry, type) and dataclasses.is_dataclass(entry)
+        return f"a section that has for each name {_section_words(entry, True) if is_section else _words(entry)}"
+    return _section_words(bare)
+
+
+def _section_words(kind: Any, shows_a_key: bool = False) -> str:
+    """Describe a section by its required keys. `shows_a_key`: by its first key, if it requires none."""
+    options = class_options_by_key(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}
+    shown = [f"{key}: {key.upper()}" for key, option in options.items() if option.default_value is MISSING]
+    if shows_a_key and not shown:
+        shown = [f"{next(iter(options))}: VALUE"]
+    return "a section" + f", such as {{{', '.join(shown)}}}" * bool(shown)
 
 
 def check_option_bounds(options: Any, where: str) -> None:

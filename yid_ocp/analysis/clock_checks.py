@@ -176,6 +176,10 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSe
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
+def _lateness_text(late: float) -> str:
+    return f"{1e3 * abs(late):.3g} ms {'late' if late > 0 else 'early'}"
+
+
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
     """Return the formula that corrects time stamps which are `late` [s] at the time `middle` [s] and have a `drift`."""
     return f"replace the times t of the points by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
@@ -251,7 +255,7 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
     issues, advice = list[Issue](), "values may be used, as the fit shifts the times. If you know the offset, import "
     advice += "again with --clock-offset FILE=SECONDS"
     for (i, name), (shift, std) in late.items():
-        own, said = recordings[i].name, f"{1e3 * abs(shift):.3g} ms {'late' if shift > 0 else 'early'}"
+        own, said = recordings[i].name, _lateness_text(shift)
         words = f"a fit finds time stamps of {name} {said} and corrects them"
         ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
         if ratio > 1:
@@ -320,8 +324,7 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
             if error is None or not (error.drifts_beyond(limit) and error.explained > _MIN_EXPLAINED_FRACTION):
                 continue
             if abs(late := error.delay) > _MAX_DELAY_PER_DRIFT * abs(error.whole_drift):
-                side = "late" if late > 0 else "early"
-                words = f"time stamps of {group.name} are about {1e3 * abs(late):.3g} ms {side} on the joints' clock"
+                words = f"time stamps of {group.name} are about {_lateness_text(late)} on the joints' clock"
                 advice = f"add {-late:+.3g} s to their times, and repeat this command"
                 yield Issue("clock_offset", words, "not_trusted", abs(late) / limit, advice, "", group.name, "t")
             else:

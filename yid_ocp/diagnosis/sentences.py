@@ -224,6 +224,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     links = "The model has too few links. The resulting error is not part of these numbers."
     fitted, problem = result.nominal_model.values, result.nominal_model.problem
     divided = problem.options.divided_links_model
+    more_links = listed(divided.settings) if divided else ""
     predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
     tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
     lost = listed([group for group in measured if group not in tested])
@@ -241,10 +242,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (laws, (other, "Compare friction laws by `yid-ocp friction`. It needs recordings of two motions or more.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
-        (
-            result.is_corrected_for_links,
-            (links, f"For other commands, set {listed(divided.settings) if divided else None}."),
-        ),
+        (result.is_corrected_for_links, (links, f"For other commands, set {more_links}.")),
     )
 
 

@@ -45,7 +45,7 @@ from yid_ocp.report.terminal import (
 _MAX_FORECASTS = 5  # largest number of listed candidates that were not fitted; result.json has all
 _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak")
-"""Verdicts of parameters whose values are shown. A parameter of a diagnosis has the verdict None."""
+"""Verdicts of parameters whose values are shown."""
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
 _SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}

@@ -126,9 +126,10 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[l
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     kinds = {"warning": "warning", "not_trusted": "issue", "refused": "issue"}
-    keys = (f" (in CONFIG.yaml: {own.setting})" if own.setting else "" for own in found)
-    rows = zip((kinds[own.severity] for own in found), found, keys, strict=True)
-    said = [f"{kind} ({own.certainty_word}): {own.what}\n  try: {own.advice}{key}" for kind, own, key in rows]
+    said = []
+    for own in found:
+        setting = f" (in CONFIG.yaml: {own.setting})" if own.setting else ""
+        said.append(f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n  try: {own.advice}{setting}")
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
     is_severe = bool(units) or any(own.severity != "warning" for own in found)

@@ -191,7 +191,7 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
     if run.plan.parameter_run_folder is not None:
         result, origin = _read_parameter_run(run, ("solve", "diagnose"))
         found, sizes = _parameter_and_effect_values(result)
-        _require_same_model(run, result.get("parameters", result.get("absorption", {})), known.names)
+        _require_same_model(run, result["parameters" if "parameters" in result else "absorption"], known.names)
         values |= {name: value for name, value in found.items() if name in known}
     with add_setting_location_to_errors(run, "plan"):
         plan = plan_informative_motion(problem, run.plan, values, sizes, progress)
@@ -200,12 +200,14 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
 
 def _require_same_model(run: RunSettings, found: Mapping[str, Mapping[str, Any]], own: Collection[str]) -> None:
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
-    free, folder = {name for name, entry in found.items() if entry.get("free", True)}, run.plan.parameter_run_folder
-    allowed, hint = "a run of `solve` on the same model", "list the same effects under model.effects"
-    what = f"the model of {folder} has effects that this one lacks: {', '.join(lacking)}" if lacking else ""
-    if not lacking and free and free.isdisjoint(own):
+    free = {name for name, entry in found.items() if entry.get("free", True)}
+    folder, allowed = run.plan.parameter_run_folder, "a run of `solve` on the same model"
+    if lacking:
+        what = f"the model of {folder} has effects that this one lacks: {', '.join(lacking)}"
+        hint = "list the same effects under model.effects"
+        raise run.config_error(what, "plan", "parameter_run_folder", allowed=allowed, hint=hint)
+    if free and free.isdisjoint(own):
         what, hint = f"{folder} estimated no parameter of this model", "give the run folder of another run"
-    if what:
         raise run.config_error(what, "plan", "parameter_run_folder", allowed=allowed, hint=hint)
 
 
