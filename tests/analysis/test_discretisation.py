@@ -195,7 +195,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     told, notes = parameter_shifts_at_finer_discretisation(
         coarse, found.x, found.evaluation, ("links", "time_step"), NULL_PROGRESS
     )
-    assert notes == []
+    assert notes == {}
     assert {name: entry.time_step for name, entry in told.items()} == pytest.approx(own, rel=1e-6)
     assert {entry.links for entry in told.values()} == {None}
     left = predicted_refit_residual_at_finer_step(fine, coarse, found.x, found.evaluation, True)

@@ -25,7 +25,7 @@ from yid_ocp.report.terminal import summary_blocks
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
-        "covariance", "discretisation_notes", "finer_settings", "stability",
+        "covariance", "refinement_notes", "finer_settings", "stability",
     "issues", "torque_offsets", "to_use", "unused_efforts",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval", "meaning"}

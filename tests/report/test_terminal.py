@@ -115,6 +115,9 @@ def test_a_solve_says_what_is_not_found():
     )
     at = many.index("  --set parameters.a.free=false")
     assert many[at + 1 : at + 4] == [f"  --set parameters.{own}.free=false" for own in "bcd"]
+    options = " ".join(f"--set parameters.{own}.free=false" for own in "abcd")
+    again = many[many.index("estimate again with the advised options:") + 1]
+    assert again == f"  yid-ocp solve CONFIG {options}"
     assert line_of(lines, "a").split() == ["a", "–", "N", "m/rad", "cannot", "be", "found", "0", "to", "2"]
     said = " ".join(told("yid-solve/1", solved(status="iteration_limit", fit=BAD | {"chi2_per_dof": 2e3})))
     parts = (
@@ -195,7 +198,7 @@ def test_an_interval_is_shown_of_every_number_that_is_known():
 def test_a_solve_says_which_estimates_a_finer_model_moves():
     changes = {"p.a": (-5.5, 0.01, 0.073), "p.b": (0.1, -0.02, 0.2), "p.c": (1e3, 1e3, None)}
     moved = {name: dict(zip(("links", "time_step", "std"), own, strict=True)) for name, own in changes.items()}
-    more = {"discretisation_notes": ["it snaps"], "finer_settings": {"links": ["model.object.links: 8"]}}
+    more = {"refinement_notes": {"links": "it snaps"}, "finer_settings": {"links": ["model.object.links: 8"]}}
     lines = told("yid-solve/1", solved(discretisation=moved, **more))
     said = "Twice the links would change 1 estimate by more than noise, most of all p.a (by -5.5). The ±"
     arm = {"a": {"encoder_noise": 0.5, "std": 0.1}}
@@ -343,3 +346,14 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
 )
 def test_names_with_consecutive_numbers_are_told_by_their_pattern(names, said):
     assert abbreviated_names_text(names) == said
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_the_next_command_of_check_follows_the_advice(coarse):
+    own = {"recording": "a", "role": "estimate", "groups": {}, "noise": {}, "grasp_gaps": {}}
+    issue = dict.fromkeys(("where", "what", "advice"), "x") | {"certainty": "likely", "severity": "warning"}
+    issue |= {"cause": "noise_overstated", "setting": "sensors.camera.std: 0.001"}
+    found = {"warnings": ["too coarse"] * coarse, "links": [], "time_step": [], "message": ""}
+    result = {"warnings": [], "convergence": found, "recordings": [own], "issues": [issue], "mechanics": {}}
+    options = "--set sensors.camera.std=0.001" + " --set output.checked_discretisation=both" * coarse
+    assert f"  yid-ocp solve CONFIG {options}" in told("yid-check/1", result)

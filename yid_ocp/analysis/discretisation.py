@@ -350,15 +350,15 @@ def finer_settings(problem: EstimationProblem) -> dict[str, list[str]]:
 
 def parameter_shifts_at_finer_discretisation(
     problem: EstimationProblem, x: Array, at_x: Evaluation, kinds: Sequence[RefinementKind], progress: Progress
-) -> tuple[dict[str, EstimateShiftByDiscretisation], list[str]]:
+) -> tuple[dict[str, EstimateShiftByDiscretisation], dict[str, str]]:
     """Compute how much estimates change with twice the links, half the time step, and more noise of encoders.
 
     `kinds` selects `links` and `time_step`; with any, noise is added. `x` (nx,) is the estimate, `at_x` its evaluation
-    with Jacobian. Returns the shifts by shared free parameter, and notes on refinements that failed or would remove a
+    with Jacobian. Returns the shifts by shared free parameter, and by kind a note if it failed or would remove a
     quarter of the misfit.
     """
     found: dict[str, dict[str, float]] = {}
-    notes, settings = list[str](), finer_settings(problem)
+    notes, settings = dict[str, str](), finer_settings(problem)
     for key in kinds:
         words = _REFINEMENT_DESCRIPTIONS[key]
         finer = abbreviated_names_text(settings.get(key, ()))
@@ -372,13 +372,13 @@ def parameter_shifts_at_finer_discretisation(
         if isinstance(own, str):
             remedy = f"To see it, set {finer}, run `solve` again and compare the estimates."
             usable = "The estimates may be used, but their ± leaves this error out."
-            notes.append(f"Whether {words} would change the estimates is unknown: {own}. {usable} {remedy}")
+            notes[key] = f"Whether {words} would change the estimates is unknown: {own}. {usable} {remedy}"
         else:
             found[key], left, _ = own
             excess, rest = (max(float(r @ r) - len(r), 0.0) for r in (at_x.residual, left))
             if excess - rest > max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left)):
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
-                notes.append(f"{said}. First set {finer}, and run `solve` again.")
+                notes[key] = f"{said}. First set {finer}, and run `solve` again."
     if kinds and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()

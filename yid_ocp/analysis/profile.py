@@ -92,7 +92,7 @@ def solution_with_profile_intervals(
     if not usable or not is_small_enough_for_profiles(problem):
         return solution
     sizes = uncertainty.typical_parameter_magnitudes(problem, solution.x)
-    asked, better_fits = {}, list[str]()
+    asked, better_fits = {}, dict[str, str]()
     for name, entry in solution.parameters.items():
         size = sizes.get(name.split("[")[0], math.nan)
         small = entry.value < _SMALL_VALUE_FRACTION * size
@@ -107,13 +107,14 @@ def solution_with_profile_intervals(
         if entry.verdict != "not_identifiable" and not uncertainty.needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = uncertainty.apply_profile_interval(entry, profile.interval, size)
-            better_fits.extend(f"For {name}, {text}." for text in [profile.better_fit] if text)
+            if profile.better_fit:
+                better_fits[name] = f"For {name}, {profile.better_fit}."
         return entry
 
     # each parameter takes about one and a half times as long as the solution
     progress.begin_stage(f"computing 95 % intervals of {', '.join(asked)}", 7.5 * len(asked), 5.2)
     found = apply_function_per_parameter_at_optimum(judged, problem, solution.x, tuple(asked), progress)
-    checks = uncertainty.EstimateChecksBeyondFit(notes=tuple(better_fits)) if better_fits else solution.checks
+    checks = uncertainty.EstimateChecksBeyondFit(notes=better_fits) if better_fits else solution.checks
     return replace(solution, parameters={**solution.parameters, **found}, checks=checks)
 
 

@@ -581,8 +581,8 @@ class EstimateChecksBeyondFit:
         Standard deviation of every free parameter, without discretisation error.
     discretisation_shifts : mapping of str to EstimateShiftByDiscretisation
         Shift of every free parameter in each finer model that was tried.
-    notes, uncounted_errors : tuple of str
-        Why a shift is unknown; discretisations whose error the standard deviations do not include.
+    notes, uncounted_errors : mapping of str to str, tuple of str
+        Notes on refinements or parameters; discretisations whose error the standard deviations do not include.
     expected_prediction_errors : mapping of recording to mapping of channel to float
         Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
@@ -591,7 +591,7 @@ class EstimateChecksBeyondFit:
 
     data_std: Mapping[str, float] = field(default_factory=dict)
     discretisation_shifts: Mapping[str, EstimateShiftByDiscretisation] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: Mapping[str, str] = field(default_factory=dict)
     uncounted_errors: tuple[str, ...] = ()
     held_out_predictions: tuple[EpisodeAndPredictionOrFailure, ...] = ()
     expected_prediction_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)

@@ -29,6 +29,7 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    advised_options,
     bound_range_text,
     copyable_estimates_blocks,
     discretisation_shift_sentences,
@@ -39,6 +40,7 @@ from yid_ocp.report.terminal import (
     misfit_summary_blocks,
     next_steps_table,
     scale_and_unit_with_metres_as_mm,
+    setting_option,
     shown_unit,
     torque_offset_table,
     unused_efforts_sentence,
@@ -59,7 +61,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from () if is_trusted else issue_summary_blocks(result)
     if converged:
         yield from misfit_summary_blocks(result, free)
-        texts = [*result.get("discretisation_notes", ()), *_bound_sentences(free, fit["explains"])]
+        texts = [*result.get("refinement_notes", {}).values(), *_bound_sentences(free, fit["explains"])]
         if fit["explains"]:
             texts += _gap_sentences(result)
             is_safe = not texts
@@ -124,14 +126,14 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
         asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
         return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
     lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
-    notes, cures = " ".join(result.get("discretisation_notes", ())), discretisation_shift_sentences(result)[1]
-    settings = result.get("finer_settings", {}).values()
-    cures += (text for own in settings if f"set {abbreviated_names_text(own)}," in notes for text in own)
-    options = " ".join(f"--set {shlex.quote(text.replace(': ', '=', 1))}" for text in dict.fromkeys(cures))
-    steps = {"estimate again with the finer model": f"solve {options}"} if cures else {}
+    notes, cures = result.get("refinement_notes", {}), discretisation_shift_sentences(result)[1]
+    cures += (text for key, own in result.get("finer_settings", {}).items() if key in notes for text in own)
+    finer, advised = map(setting_option, dict.fromkeys(cures)), advised_options(issues)
+    steps = {"estimate again with the finer model": " ".join(["solve", *finer])} if cures else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
         steps["find what the model lacks, as advised above"] = "diagnose"
-    steps |= {"estimate again, after the advice above is followed": "solve"} if issues else {}
+    again = "estimate again" + (" with the advised options" if advised else ", after the advice above is followed")
+    steps |= {again: " ".join(["solve", *advised])} if issues else {}
     if result["fit"]["data_trusted"] and not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif result["fit"]["data_trusted"] and len(lost) < len(free):
@@ -518,7 +520,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}", is_page_only=True)
     yield convergence["message"]
     step += ", after the advice above is followed" * is_advised
-    yield next_steps_table(result, {step: "solve"} if result["recordings"] and not severe else {})
+    finer = ["--set output.checked_discretisation=both"] if coarse else []
+    solve = " ".join(["solve", *advised_options(result.get("issues", ())), *finer])
+    yield next_steps_table(result, {step: solve} if result["recordings"] and not severe else {})
 
 
 def _noise_cells(noise: Mapping[str, Any], share: float) -> Iterator[Sequence[str]]:

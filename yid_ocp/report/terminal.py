@@ -6,7 +6,7 @@ import math
 import re
 import shlex
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -98,6 +98,19 @@ def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
     return "; ".join(dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[entry["cause"]] for entry in shown))
 
 
+def advised_options(issues: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the options of the advice on issues, with `--set`. The first issue, the strongest, sets a name."""
+    lines = dict[str, str]()
+    for own in issues:
+        lines.setdefault(own["setting"].partition(":")[0], own["setting"])
+    return [setting_option(part) for line in filter(None, lines.values()) for part in line.split("; ")]
+
+
+def setting_option(setting: str) -> str:
+    """Return a setting, given as a line of YAML, as an option of a command."""
+    return f"--set {shlex.quote(setting.replace(': ', '=', 1))}"
+
+
 def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True) -> SummaryBlockOrTextIterator:
     """Yield the issues in a result with numbers, advice and settings for each cause, and a table if there are many."""
     issues = result.get("issues", ())
@@ -107,14 +120,11 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     for (cause, _), (first, *others) in kinds.items():
         where = abbreviated_names_text(list(dict.fromkeys(own["where"] for own in (first, *others))))
         rows.append((ISSUE_CAUSE_DESCRIPTIONS[cause], where, first["certainty"]))
-        lines = dict[str, str]()
-        for own in (first, *others):  # the first issue is the strongest; its value of a setting counts
-            lines.setdefault(own["setting"].partition(":")[0], own["setting"])
-        options = [shlex.quote(part.replace(": ", "=", 1)) for own in lines.values() for part in own.split("; ")]
-        do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if all(lines) else ".")
+        options = advised_options((first, *others))
+        do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if options else ".")
         example = " at the first place," * any(own["what"] != first["what"] for own in others)
         text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
-        advice += [text, CodeBlock("\n".join(f"--set {option}" for option in options if all(lines)))]
+        advice += [text, CodeBlock("\n".join(options))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
@@ -169,7 +179,8 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     lost = {key: own for key, own in moving.items() if own["verdict"] == "not_identifiable" and own.get("initial")}
     near = {n: e for n, e in lost.items() if math.isclose(e["value"], e["initial"], rel_tol=_MAX_CHANGE_FROM_START)}
     names = abbreviated_names_text([f"{name} ({own['initial']:.4g} {own['unit']})" for name, own in near.items()])
-    is_coarse = any("First set " in note for note in result.get("discretisation_notes", ()))
+    shifts, notes = result.get("discretisation", {}).values(), result.get("refinement_notes", {})
+    is_coarse = any(own.get(kind) is not None for own in shifts for kind in notes)  # not only an unknown shift
     said = uncertainty.goodness_of_fit_message(fit, with_advice=fit["data_trusted"] and not is_coarse)
     if is_coarse:
         said += " First make the model finer, as follows."

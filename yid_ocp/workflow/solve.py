@@ -58,7 +58,7 @@ def run_solve(
                 for name, own in checks.discretisation_shifts.items()
             },
             "finer_settings": discretisation.finer_settings(problem),
-            "discretisation_notes": list(checks.notes),
+            "refinement_notes": dict(checks.notes),
             "stability": checks.step_stability,
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),
             "to_use": prediction_outputs.copyable_estimate_texts(*copied, export, checks.uncounted_errors),
