@@ -493,10 +493,11 @@ def test_the_error_of_links_is_uncounted_where_an_object_has_them_and_nothing_is
     layouts = (SimpleNamespace(name="T1"),) if segments else ()
     options = SimpleNamespace(checked_discretisations=kinds, divided_links_model=divided)
     made = SimpleNamespace(options=options, system=SimpleNamespace(segment_layouts=layouts))
-    monkeypatch.setattr(estimation.discretisation, "parameter_shifts_at_finer_discretisation", lambda *_: ({}, {"links": "why"}))
+    notes = {"links": "why"}
+    monkeypatch.setattr(estimation.discretisation, "parameter_shifts_at_finer_discretisation", lambda *_: ({}, notes))
     monkeypatch.setattr(estimation.uncertainty, "typical_parameter_magnitudes", lambda *_: {"k": 1.0})
     fit = replace(solution(k=estimate(2.0)), evaluation=SimpleNamespace())
     found, checks = estimation.add_discretisation_errors(made, fit, None)
     assert found.parameters == fit.parameters
-    assert checks.notes == {"links": "why"}
+    assert checks.notes == notes
     assert checks.uncounted_errors == (("from the number of links",) if links else ()) + ("from the time step",)

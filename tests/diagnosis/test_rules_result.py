@@ -35,7 +35,8 @@ def test_numbers_that_are_not_finite_become_null():
 
 
 KEYS = """format verdict gap where which effects remaining reason rejected_candidates confusable events next_experiment
-statistics summary absorption steps unseen untried baseline counterfactual seconds law probability rival_changes"""
+next_steps statistics summary absorption steps unseen untried baseline counterfactual seconds law probability
+rival_changes"""
 
 
 def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():

@@ -44,7 +44,7 @@ from yid_ocp.diagnosis.baseline import (
 )
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
-from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text, next_step_texts, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
@@ -188,10 +188,14 @@ def compared():
         yield f"{name} with effects", finding(counterfactual=CounterfactualPredictionErrors(better, other))
 
 
+def all_told(made) -> str:
+    return "\n".join([diagnosis_summary_text(made), "Do next:", *next_step_texts(made)])
+
+
 def said() -> dict[str, str]:
     """Every text by its case."""
     found = {
-        f"{part.__name__}: {name}": diagnosis_summary_text(made)
+        f"{part.__name__}: {name}": all_told(made)
         for part in (gaps, places, effects, unknown)
         for name, made in part()
     }
@@ -216,8 +220,8 @@ def said() -> dict[str, str]:
     odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
     for events in ((force,), (force, odd), (force,) * 14):
         seen = EventSet(events, (_Overspeed("run_0", "elbow", 3.0),))
-        found[f"events: {len(events)}"] = diagnosis_summary_text(finding("no_gap", events=seen, **NO_EFFECT))
-    found |= {f"baseline: {name}": diagnosis_summary_text(made) for name, made in compared()}
+        found[f"events: {len(events)}"] = all_told(finding("no_gap", events=seen, **NO_EFFECT))
+    found |= {f"baseline: {name}": all_told(made) for name, made in compared()}
     return found
 
 
@@ -238,7 +242,7 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
     verdict = how if how in ("effect", "no_gap") else "unknown"
     none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(FRICTION),)}
     made = finding(verdict, **known, **none, **({} if verdict == how else {"unknown_reason": how}))
-    assert_nothing_impossible_is_said(made, diagnosis_summary_text(made))
+    assert_nothing_impossible_is_said(made, all_told(made))
 
 
 def test_a_diagnosis_says_what_is_written_down():
@@ -248,9 +252,9 @@ def test_a_diagnosis_says_what_is_written_down():
 def test_friction_is_to_be_fitted_law_by_law(monkeypatch):
     kinds = {kind for own in EFFECT_KINDS_BY_FRICTION_LAW.values() for kind in own}
     assert all(EFFECTS[kind].is_joint_friction for kind in kinds)
-    assert "yid-ocp friction" not in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+    assert "yid-ocp friction" not in all_told(with_effect(FRICTION, 0.5))
     monkeypatch.setattr(EffectBase, "is_joint_friction", True)
-    assert "Compare friction laws by `yid-ocp friction`" in diagnosis_summary_text(with_effect(FRICTION, 0.5))
+    assert "Compare friction laws by `yid-ocp friction`" in all_told(with_effect(FRICTION, 0.5))
 
 
 def test_effects_that_only_a_prior_separates_from_the_nominal_model_share_one_advice():
@@ -259,7 +263,7 @@ def test_effects_that_only_a_prior_separates_from_the_nominal_model_share_one_ad
     known = {"residual_rows": SimpleNamespace(**rows), "shared_parameters": ("k",)}
     pairs = [(own, SimpleNamespace(unknown_names=("k", f"{own.label}.a"), **known)) for own in (FRICTION, OFFSET)]
     models = [replace(fit([own], problem=problem), evaluation=jacobian) for own, problem in pairs]
-    said = diagnosis_summary_text(with_effect(FRICTION, 0.5, single_effect_models=tuple(models)))
+    said = all_told(with_effect(FRICTION, 0.5, single_effect_models=tuple(models)))
     assert "separate friction@elbow from k; offset@wrist from k. To determine an effect, measure" in said
 
 

@@ -32,7 +32,7 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candidates_at_location, screen_candidates
-from yid_ocp.diagnosis.sentences import diagnosis_summary_text, recommended_experiment_text
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text, next_step_texts, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
 from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress, count_with_noun
@@ -426,7 +426,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         law=law,
     )
     finding = replace(finding, next_experiment=recommended_experiment_text(finding))
-    return replace(finding, summary=diagnosis_summary_text(finding))
+    return replace(finding, summary=diagnosis_summary_text(finding), next_steps=next_step_texts(finding))
 
 
 def _fitted_nominal_model(

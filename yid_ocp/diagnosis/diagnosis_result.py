@@ -46,6 +46,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     baseline_comparison: ParameterShiftsSinceBaseline | None = None
     counterfactual: CounterfactualPredictionErrors | None = None
     next_experiment: str = ""
+    next_steps: tuple[str, ...] = ()  # what to do next, in order; the experiment comes last
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
@@ -111,6 +112,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             ],
             "events": [event.to_dict() for event in self.events.disturbances],
             "next_experiment": self.next_experiment,
+            "next_steps": self.next_steps,
             "rival_changes": {
                 "probability": self.rival_probability,
                 "parameters": {shift.name: shift.to_dict() for shift in self.rival_shifts},

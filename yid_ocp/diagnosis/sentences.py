@@ -62,20 +62,22 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
 
 
 def diagnosis_summary_text(result: DiagnosisResult) -> str:
-    """Summarise a diagnosis in lines: may the model be used, is there a gap and why, what else matters, what to do."""
-    step, since, notes = result.stated_and_used_time_step[1], result.baseline_comparison, _notes(result)
-    pushes = _pushes(result)
-    text = [_lead(result), *(found for found, _ in pushes)]
+    """Summarise a diagnosis in lines: may the model be used, is there a gap and why, and what else matters."""
+    step, since = result.stated_and_used_time_step[1], result.baseline_comparison
+    text = [_lead(result), *(found for found, _ in _pushes(result))]
     text += {"insufficient_data": [], "no_gap": _why_no_gap(result)}.get(result.verdict, _why_gap(result))
     text += [] if result.law is None else [result.law.sentence]
     text += [*(cut.sentence(step) for cut in result.truncated_recordings), *_bound_by_priors(result)]
     text += [] if since is None else since.sentences(has_rivals=bool(result.rival_shifts))
     text += [] if result.counterfactual is None else result.counterfactual.sentences
-    text += [note for note, _ in notes]
-    text += result.events.overspeed_sentences(result.thresholds.max_joint_speed)
-    steps = [*dict.fromkeys([*filter(None, (step for _, step in (*notes, *pushes))), result.next_experiment])]
-    numbered = " ".join(f"{i}. {step}" for i, step in enumerate(steps, 1))
-    return "\n".join([*text, f"Do next: {_said((steps[1:], numbered), (True, steps[-1]))[0]}"])
+    text += [note for note, _ in _notes(result)]
+    return "\n".join([*text, *result.events.overspeed_sentences(result.thresholds.max_joint_speed)])
+
+
+def next_step_texts(result: DiagnosisResult) -> tuple[str, ...]:
+    """Return what to do next, in order; the recommended experiment comes last."""
+    advice = (step for _, step in (*_notes(result), *_pushes(result)))
+    return tuple(dict.fromkeys([*filter(None, advice), result.next_experiment]))
 
 
 def _changed(result: DiagnosisResult) -> bool:

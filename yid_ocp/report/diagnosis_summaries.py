@@ -61,7 +61,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     kinds = dict.fromkeys(own["kind"] for own in result.get("effects", ()) if own["kind"] in EFFECTS)
     meant = " ".join(f"{kind}: {(EFFECTS[kind].__doc__ or '').partition(chr(10))[0]}" for kind in kinds)
     yield from issue_summary_blocks(result) if is_severe else ()
-    parts = f"{head}: {verdict}. {gap}", *others[:-1], unused_efforts_sentence(result), meant
+    parts = f"{head}: {verdict}. {gap}", *others, unused_efforts_sentence(result), meant
     yield from (SummaryStatement(part, "verdict") for part in parts)
     yield from () if is_severe else issue_summary_blocks(result)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
@@ -105,7 +105,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
     yield from copyable_estimates_blocks(result)
-    yield from (SummaryStatement(step, "verdict") for step in others[-1:])
+    to_do = result.get("next_steps", ())
+    yield SummaryStatement(f"Do next: {to_do[0]}" if len(to_do) == 1 else "Do next:" * bool(to_do), "verdict")
+    yield from (SummaryStatement(f"{i}. {step}", "verdict") for i, step in enumerate(to_do, 1) if to_do[1:])
     if result["next_plan"] is not None:
         yield "To separate the effects which these recordings cannot distinguish, plan a motion by this command:"
         known = result["next_plan"].items()
