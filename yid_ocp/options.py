@@ -136,18 +136,21 @@ def _words(hint: Any) -> str:
         if names := [name for own in choices for name in own.registry]:
             return f"a section, such as {{{names[0]}: {{}}}}, with names among {', '.join(names)}"
         entry = mapping_value_type(bare)
-        is_section = isinstance(entry, type) and dataclasses.is_dataclass(entry)
-        return f"a section that has for each name {_section_words(entry, True) if is_section else _words(entry)}"
-    return _section_words(bare)
+        if isinstance(entry, type) and dataclasses.is_dataclass(entry):
+            return f"a section, such as {{NAME: {_section_example(entry, True)}}}"
+        return f"a section, such as {{NAME: VALUE}}, with {_words(entry)} as VALUE"
+    is_section = isinstance(bare, type) and dataclasses.is_dataclass(bare)
+    example = _section_example(bare) if is_section else ""
+    return "a section" + f", such as {example}" * bool(example)
 
 
-def _section_words(kind: Any, shows_a_key: bool = False) -> str:
-    """Describe a section by its required keys. `shows_a_key`: by its first key, if it requires none."""
-    options = class_options_by_key(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}
+def _section_example(kind: type, shows_a_key: bool = False) -> str:
+    """Write a section with its required keys. `shows_a_key`: with its first key, if it requires none."""
+    options = class_options_by_key(kind)
     shown = [f"{key}: {key.upper()}" for key, option in options.items() if option.default_value is MISSING]
     if shows_a_key and not shown:
         shown = [f"{next(iter(options))}: VALUE"]
-    return "a section" + f", such as {{{', '.join(shown)}}}" * bool(shown)
+    return f"{{{', '.join(shown)}}}" if shown else ""
 
 
 def check_option_bounds(options: Any, where: str) -> None:

@@ -271,7 +271,7 @@ def joint_excitation_issues(
                 widest, name = width, recording.name
         if name and widest < limit:
             words = f"{joint} turns by at most {widest:.2g} rad ({limit:.2g} rad is needed for {', '.join(parameters)})"
-            advice, depth = "turn the joint further, or fix its parameters", limit / max(widest, 1e-9)
+            advice, depth = "turn the joint further, or fix these parameters", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
             yield Issue("weak_excitation", words, "warning", depth, advice, *where, setting=line)

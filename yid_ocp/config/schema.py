@@ -83,6 +83,8 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     hint = f"{first} {RENAMED_NAMES_HINT}"
     if name.partition(".")[0] in known and "." in name:
         hint = f"write --set {name}=VALUE, or nested keys in the file, such as parameters: {{NAME: {{free: false}}}}"
+    if name.isdigit():
+        hint = "write numbers with a decimal point: a comma separates the keys of a section"
     if ":" in name:
         hint = "put a space after the colon, as in {" + name.replace(":", ": ") + "}"
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

@@ -102,7 +102,7 @@ def _lead(result: DiagnosisResult) -> str:
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
     gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
-    shown = f"would reveal {sum(seen)} of {len(seen)} effects of the largest expected size"
+    shown = f"would reveal {sum(seen)} of {len(seen)} effects at their largest expected size"
     few = f"{tests[0].degrees_of_freedom:.0f} independent samples (more than {unknowns}, one per unknown, are needed)"
     beyond = ", but expect errors beyond noise" * (result.remaining_test.p_value < limits.significance_level)
     names = listed([effect.label for effect in result.accepted_effects])
@@ -115,7 +115,8 @@ def _lead(result: DiagnosisResult) -> str:
     probable = " ".join(_said(*shares))
     use = "Use the model for motions like these."
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
-    none = f"{use} There is no relevant gap: {sizes}. The recordings {shown}. Smaller ones may bias the estimates."
+    none = f"{use} There is no relevant gap: {sizes} ({chance}). The recordings {shown}. "
+    none += "Smaller ones may bias the estimates."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
     why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
@@ -205,7 +206,7 @@ def _pushes(result: DiagnosisResult) -> list[tuple[str, str]]:
     told = listed([event.text for event in events], max_entries=_MAX_NAMED)
     left_out = f"The tests leave out {count_with_noun(len(events), 'brief disturbance')}: {told}."
     check = "If you did not push the arm on purpose, look at the recordings at the times of the disturbances."
-    return _said((events, (left_out, check)))
+    return _said((events, (left_out, check * any(event.kind == "force" for event in events))))
 
 
 def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
@@ -260,12 +261,13 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
-    more = f"Only these kinds could be tried: {', '.join(kinds)}. To try all effects, set diagnosis.candidates: all."
+    more = f"Only these kinds could be tried: {', '.join(kinds)}. If diagnosis.candidates limits them, set it to all."
     more *= len(kinds) <= _FEW_KINDS
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
     unlike = f"the error resembles no tried effect (no p-value is below {limits.significance_level:g})"
     failed = "every refit with an effect failed"
-    causes = (result.untried, stopped), (result.record.refits, failed), (True, unlike)
+    alike = any(score.p_value < limits.significance_level for score in result.screening.candidate_scores)
+    causes = (not alike, unlike), (result.untried, stopped), (True, failed)
     none = _said((result.single_effect_models, tried), *causes)[0]
     few += "".join(_said((math.isfinite(closed), end)))
     why, advice = {

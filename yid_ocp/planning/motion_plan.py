@@ -94,8 +94,9 @@ def plan_motion_to_target(
     travel = end.state[mover.moved_joint_indices] - mover.moved_joint_start_positions
     least = np.abs(travel) / [options.limits.velocity_fraction * (joint.velocity_limit or math.inf) for joint in joints]
     if options.duration < (shortest := float(least.max())):
-        name, turn = joints[int(least.argmax())].name, abs(travel[int(least.argmax())])
-        what = f"joint {name} would move by {turn:.3g} rad or m in {options.duration:g} s, faster than its speed limit"
+        joint, turn = joints[int(least.argmax())], abs(travel[int(least.argmax())])
+        size = f"{turn:.3g} {'rad' if joint.kind == 'revolute' else 'm'}"
+        what = f"joint {joint.name} would move by {size} in {options.duration:g} s, faster than its speed limit"
         hint = "set a longer plan.duration, or a target nearer to the start"
         raise ConfigError(what, where="plan.duration", allowed=f"at least {shortest:.3g} s", hint=hint)
 

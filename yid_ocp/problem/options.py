@@ -146,7 +146,9 @@ class ProblemOptions:
         float, Gt(0), OptionInfo("standard deviation of an estimated initial configuration", "rad")
     ] = 0.05
     initial_velocity_prior_std: Annotated[float, Gt(0), OptionInfo("velocity std of an estimated start", "rad/s")] = 0.2
-    duration: Annotated[float | None, Gt(0), OptionInfo("use only the first seconds of every recording", "s")] = None
+    duration: Annotated[
+        float | None, Gt(0), OptionInfo("number of seconds from the start of every recording that are used", "s")
+    ] = None
     initial_state_fit_window: Annotated[
         float, Gt(0), OptionInfo("duration of the measured points used for a fitted initial state", "s")
     ] = 0.02

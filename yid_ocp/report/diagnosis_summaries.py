@@ -339,7 +339,8 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         told = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
         rows.append((name, *cells, *told, shown_unit(own["unit"]), VERDICT_TABLE_TEXTS[own["verdict"]]))
     yield from misfit_summary_blocks(judged, free)
-    agree = f"Use the column `{best}`: all methods agree within their ± on the parameters that are found."
+    agree = "All methods agree within their ± on the parameters that are found, so you can use any column. The "
+    agree += f"verdicts are those of `{best}`."
     objections = [*_objections_to_agreement(result, methods, best)] or [agree]
     yield from (SummaryStatement(text, "conclusion") for text in objections)
     yield from issue_summary_blocks(result)
@@ -412,17 +413,21 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         note = "chosen" * (law == best and not is_absent) + " (the fit did not converge)" * (not entry["converged"])
         rows.append((law, *(f"{entry[key]:.3g}" for key in keys), note))
     errors = f"held-out error {error}, worst law {worst:.3g}{noise}"
-    text = f"Use the law '{best}' for these joints: {joints}. No simpler law predicts as well ({errors})."
+    reason = "it is the simplest law, and no other one predicts clearly better"
+    if best != next(iter(result["laws"])):
+        reason = "no simpler law predicts as well"
+    text = f"Use the law '{best}' for these joints: {joints}, as {reason} ({errors})."
     if lost:
-        text = f"No law simpler than '{best}' predicts as well ({errors}), but its constants cannot be used yet: first "
-        text += f"record motions that determine {lost} ({joints})."
+        text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
+        text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
+    if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
+        text = "Do not use the constants of friction yet, because no law explains these motions: even with the best "
+        text += f"one, '{best}', the error is far larger than noise ({errors}). Run `yid-ocp diagnose`."
     if not chosen["converged"]:
         text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge."
     elif is_absent:
         text = f"Use no friction law, because these recordings do not show friction of {joints}."
     yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
-    if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
-        yield "The error is far larger than noise. To find the cause, run `yid-ocp diagnose`."
     symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
     constants: TableRows = [("joint", *symbols.values())]
     for joint in result["joints"]:
@@ -465,8 +470,9 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     drifted = [name for name, entry in result["parameters"].items() if entry["drifted"]]
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     poor = [entry["name"] for entry in runs if not entry["explains"]]
+    doubtful = f"; the model does not explain the recordings of {abbreviated_names_text(poor)}, so their ± is large"
     if not drifted and result["p_value"] >= result["level"]:
-        yield f"{'' if poor else 'No parameter changed. '}All runs agree within their uncertainty (noise alone: p {p})."
+        yield f"All runs agree within their uncertainty (noise alone: p {p}{doubtful * bool(poor)})."
     elif not drifted:
         yield f"All parameters together differ between the runs (noise alone: p {p}), but no single parameter does."
     for name in drifted:
@@ -487,9 +493,6 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
-    if poor:
-        text = f"The model did not explain the recordings of {abbreviated_names_text(poor)}"
-        yield f"{text}. The ± of such a run includes the model error, but may still be too small."
 
 
 @SUMMARIES.register("yid-overlay/1")

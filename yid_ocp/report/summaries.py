@@ -122,14 +122,17 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Return the commands that help after a fit, by purpose."""
+    issues = result.get("issues") or ()
+    advised = advised_options(issues)
     if result["status"] != "converged":
         asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
-        return {"estimate with more iterations": f"solve --set {asked[1]}={asked[2]}"} if asked else {}
-    lost, issues = _names_by_verdict(free)["not_identifiable"], result.get("issues") or ()
+        more = " ".join([f"solve --set {asked[1]}={asked[2]}", *advised]) if asked else ""
+        return {"estimate with more iterations": more} if asked else {}
+    lost = _names_by_verdict(free)["not_identifiable"]
     notes, cures = result.get("refinement_notes", {}), discretisation_shift_sentences(result)[1]
     cures += (text for key, own in result.get("finer_settings", {}).items() if key in notes for text in own)
-    finer, advised = map(setting_option, dict.fromkeys(cures)), advised_options(issues)
-    steps = {"estimate again with the finer model": " ".join(["solve", *finer])} if cures else {}
+    finer = " ".join(["solve", *map(setting_option, dict.fromkeys(cures))])
+    steps = {"estimate again with the finer model": finer} if cures else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
         steps["find what the model lacks, as advised above"] = "diagnose"
     again = "estimate again" + (" with the advised options" if advised else ", after the advice above is followed")
@@ -198,7 +201,8 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
     said = "No error exceeds twice that of noise alone, so the model predicts them well."
     if not result["fit"]["explains"] or any(error > MAX_NOISE_RATIO * x for error, x in known if error and x):
-        said = "An error above twice that of noise alone shows an error of the model."
+        said = "An error above twice that of noise alone shows an error of the model"
+        said += "." if result["status"] == "converged" else ", or of values whose search has not ended."
     said += " Noise alone includes expected errors of torques, sensors and clocks."
     yield said if known else ""
 
@@ -266,7 +270,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         return
     is_initial = result["at"] == "initial"
     interval_head = "95 % interval" if result["profiles"] else "95 % interval (approximate)"
-    rows: TableRows = [("parameter", "value", "unit", "± [% of the value]", interval_head, "verdict")]
+    head = "initial value" if is_initial else "value"
+    rows: TableRows = [("parameter", head, "unit", "± [% of the value]", interval_head, "verdict")]
     for name, entry in parameters.items():
         std = entry["std_relative"]
         spread, absolute = "infinite", None
@@ -277,7 +282,9 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
         interval = _interval_cell(entry, None if is_initial or is_stopped else absolute)
         value = value_and_uncertainty_text(entry["value"], None, verdict=None if is_initial else entry["verdict"])
         spread *= not is_stopped
-        rows.append((name, value, shown_unit(entry["unit"]), spread, interval, VERDICT_TABLE_TEXTS[entry["verdict"]]))
+        said = "would be " * (is_initial and entry["verdict"] in ("identifiable", "weak"))
+        said += VERDICT_TABLE_TEXTS[entry["verdict"]]
+        rows.append((name, value, shown_unit(entry["unit"]), spread, interval, said))
     yield from () if result["fit"] is None else misfit_summary_blocks(result, parameters)
     found, weak, lost = (_names_by_verdict(parameters)[v] for v in ("identifiable", "weak", "not_identifiable"))
     verb = "are expected to be" if is_initial else "can be"
@@ -338,8 +345,8 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
             options = "".join(f" --set sensors.{group}.used_points=null" for group in points)
             why = f"estimate from FILE, a recording with {best['words']}"
             steps[why] = f"solve --set 'recordings.estimate=[FILE]'{options}"
-        # servos cannot follow a planned motion exactly, and springs in series need more markers
-        elif not result.get("has_servos") and not any("springs in series" in own["words"] for own in hidden):
+        # springs in series need more markers
+        elif result.get("can_plan_motion") and not any("springs in series" in own["words"] for own in hidden):
             steps["plan a motion that determines more"] = "plan --set plan.goal=information"
         for _, names in sorted(together, key=lambda pair: pair[0]["verdict"] != "weak")[:1]:  # a text asks to fix it
             options = f"--set parameters.{names[0]}.free=false --set parameters.{names[0]}.initial=VALUE"

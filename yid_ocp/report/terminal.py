@@ -128,7 +128,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
-        yield f"Before you use values, follow the advice below on these issues, which the verdicts leave out: {mild}."
+        yield f"Before you use values, also follow the advice below on these issues: {mild}."
     yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 

@@ -245,8 +245,8 @@ def calibrate_camera(
         reason, advice = error.args
         if options.fix_pose and clock.search_half_width == 0:
             return calibration_without_estimation(pose, clock, reason)
-        known = "track.options.calibration.fix_pose: true and track.options.clock_offset_search.search_half_width: 0"
-        hint = f"{advice}; if camera pose and clock are known, set {known}"
+        known = "write --fix-pose and set track.options.clock_offset_search.search_half_width: 0"
+        hint = f"{advice}; if camera pose and clock are known, {known}"
         what, allowed = f"the camera cannot be calibrated by the arm: {reason}", "frames that show the moving arm"
         raise DataError(what, where=source, allowed=allowed, hint=hint) from None
 

@@ -261,7 +261,7 @@ def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> di
 def _warn(found: dict[str, Any], what: str, when: str, remedy: str, rows: list[dict[str, Any]]) -> None:
     """Warn of frequencies that differ between the first row and the last, finest row, or say that none does."""
     moved = [
-        f"mode {i} from {a:.3g} to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
+        f"mode {i} from {a:.3g} to {b:.3g} Hz"
         for i, (a, b) in enumerate(zip(rows[0]["hertz"], rows[-1]["hertz"], strict=False), start=1)
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
     ]

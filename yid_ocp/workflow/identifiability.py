@@ -157,7 +157,8 @@ def _identifiability_result(
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
         "issues": issues_to_plain_data(problem.options.data_issues),
         "what_if": None,
-        "has_servos": bool(problem.system.servos),
+        # servos cannot follow a planned motion exactly
+        "can_plan_motion": bool(problem.system.driven or problem.system.prescribed) and not problem.system.servos,
         "groups_with_chosen_points": [n for n, own in problem.options.sensors.items() if own.used_points is not None],
     }
     if information is None or unknown is None:

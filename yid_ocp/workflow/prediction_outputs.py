@@ -88,7 +88,8 @@ def copyable_estimate_texts(
     found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
     if not found:
         return {}
-    terms, springs, joints = _found_joint_terms(system, theta, found), system.elastic_joints, []
+    unknown = [name for name, own in estimates.items() if own.free and name not in found]
+    terms, springs, joints = _found_joint_terms(system, theta, found, unknown), system.elastic_joints, []
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
     turning = [joint.name for joint in system.mechanism.joints if joint.kind == "revolute"]
     lines = [_mjcf_joint_line(joint, own, turning) for joint, own in terms.items() if own and joint not in links]
@@ -116,7 +117,7 @@ def copyable_estimate_texts(
     return {
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in quoted.items()],
         "uncounted_errors": list(uncounted_errors),
-        "left_out": [n for n, e in estimates.items() if e.free and n not in found],
+        "left_out": unknown,
         "joints": joints,
         "yaml": [*model_yaml, "parameters:", *starts],
         "mjcf": lines,
@@ -126,18 +127,22 @@ def copyable_estimate_texts(
     }
 
 
-def _found_joint_terms(system: System, theta: Array, names: Iterable[str]) -> dict[str, dict[str, float]]:
-    """Return the attributes of each joint in MJCF that depend on the parameters `names`."""
+def _found_joint_terms(
+    system: System, theta: Array, names: Iterable[str], unknown: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """Return the attributes of each joint in MJCF that depend on parameters `names`, not on `unknown` ones alone."""
     values, found = dict(zip(system.parameters.names, theta, strict=True)), {}
-    moved = values | {name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in names}
-    terms, others = (system_joint_dynamics_terms(system, CasadiEvaluator(system, own)) for own in (values, moved))
+    moves = ({name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in own} for own in ((), names, unknown))
+    evaluators = (CasadiEvaluator(system, values | moved) for moved in moves)
+    terms, others, doubtful = (system_joint_dynamics_terms(system, own) for own in evaluators)
     for joint, own in terms.items():
         changed = {key for key, size in vars(own).items() if size != getattr(others[joint], key)}
         sizes = {"damping": own.damping, "armature": own.armature, "dry_friction": own.dry_friction}
         found[joint] = {key.replace("dry_friction", "frictionloss"): sizes[key] for key in sizes if key in changed}
         if changed & {"stiffness", "constant_force"} and own.stiffness > 0:
             found[joint] |= {"stiffness": own.stiffness, "springref": own.constant_force / own.stiffness}
-            found[joint] |= {"damping": own.damping} if own.damping > 0 else {}
+            is_known = own.damping == doubtful[joint].damping > 0
+            found[joint] |= {"damping": own.damping} if is_known else {}
     return found
 
 

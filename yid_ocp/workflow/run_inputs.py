@@ -177,7 +177,10 @@ def existing_input_file(run: RunSettings, file: Path, noun: str, *key: str | int
     hint = f"write {os.path.relpath(here, folder)}: paths are relative to the folder of the configuration file"
     if not is_file(here):
         hint = nearest_file_question(file, f"*{file.suffix}") or "correct the path (relative to the configuration file)"
-    raise run.config_error(f"there is no such {noun}: {file}", *key, allowed="the path of an existing file", hint=hint)
+    what = f"there is no such {noun}: {file}"
+    if file.is_dir():
+        what, hint = f"{file} is a folder, but must be a {noun}", f"write the path of a file, such as {here / 'NAME'}"
+    raise run.config_error(what, *key, allowed="the path of an existing file", hint=hint)
 
 
 def resolve_recording_path(path: str) -> Path:

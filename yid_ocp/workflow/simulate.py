@@ -55,9 +55,8 @@ def run_simulate(
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             is_short = (run.problem.duration or 0.0) > 1.01 * recording.duration
-            said = (
-                f"It has noise (seed {seed})." if noise or not run.recordings.estimate else "It has no noise (--noise)."
-            )
+            is_noisy = noise or not run.recordings.estimate
+            said = f"It has noise (seed {seed})." if is_noisy else "It has no noise. To add noise, write --noise."
             said += " The recorded motion is shorter than problem.duration." * is_short
             result |= {"status": "done", "message": said, "duration": recording.duration}
             result["file"] = str(folder.final_path / "recording.h5")

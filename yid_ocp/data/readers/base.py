@@ -219,10 +219,11 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
     """Guess the units of values that cannot be in SI units. Returns units by quantity, and the reasons as sentences."""
     units, notes, joints = dict[str, str](), list[str](), recording.joints
     if joints is not None and joints.position.size:
-        widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
-        if widest > _MAX_PLAUSIBLE_VALUES["position"]:
-            units["position"] = "deg"
-            notes.append(f"angles would reach {widest:.3g} rad, so they seem to be in degrees")
+        largest, limit = np.nanmax(np.abs(joints.position), axis=0, initial=0.0), _MAX_PLAUSIBLE_VALUES["position"]
+        if (widest := float(largest.max())) > limit:
+            units["position"], j = "deg", int(largest.argmax())
+            many = f"{np.sum(np.abs(joints.position[:, j]) > limit)} of {len(joints.t)} samples exceed {limit:.2g} rad"
+            notes.append(f"{joints.names[j]} would reach {widest:.3g} rad ({many}), so angles seem to be in degrees")
     farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
     if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
