@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class _EffectSignature:
     score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own autocorrelation
     score_prior_covariance: Array  # shape (p, p): the part of it that stated priors make
     score_bias: Array  # E[X'r] - E[X]'E[r], shape (p,): encoder noise moves both X and r
-    base_changes: Array  # of the parameters of the model's effects by the amplitudes, shape (nb, p)
+    changes: Mapping[str, Array]  # of each shared parameter by the amplitudes, shape (p,), if it hides them best
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,8 @@ class CandidateDetectability:
     effect: EffectBase
     detectable_amplitudes: dict[str, float]  # amplitudes in the parameter's unit
     is_detectable: bool  # whether one of them lies within the prior range
+    # the largest change of each shared parameter by an amplitude that is neither detectable nor beyond the prior range
+    hidden_changes: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class ScoreTestResult:
     predicted_chi2_decrease: float
     lm_statistic: float  # LM with robust covariance
     p_value: float
-    base_changes: tuple[float, ...] = ()  # of the parameters of the model's effects by the step, in order
+    changes: Mapping[str, float] = field(default_factory=dict)  # of each shared parameter by the step
 
 
 def _shape_grid(effect: EffectBase, size: int = _SHAPE_GRID_SIZE) -> list[dict[str, float]]:
@@ -132,7 +134,7 @@ def linearize_candidates(
     follows = np.split(followed, np.cumsum([own.shape[1] for own in sensitivities])[:-1], axis=1)
     for point, ((chosen, amplitudes), follow) in enumerate(zip(grid, follows, strict=True)):
         moved = sensitivities[point] - basis @ (basis.T @ sensitivities[point])
-        by_base = -follow[[others.index(name) for effect in base for name in effect.parameters.names]]
+        by_shared = -follow[[others.index(name) for name in placed.shared_parameters]]
         shifts, errors = list[Array](), [error for error, _ in known[point]]
         for error, (_, first), (_, own) in zip(errors, known[0], known[point], strict=False):
             changes, unmoved = first | own, np.zeros_like(error)
@@ -142,11 +144,12 @@ def linearize_candidates(
             shift[rows.data] = by_own - by_others @ follow
             shifts.append(shift - basis @ (basis.T @ shift))
         edges = np.cumsum([len(effect.amplitude_parameter_names) for effect, _ in chosen])[:-1]
-        split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_base, *shifts))
+        split = (np.split(np.ascontiguousarray(own), edges, axis=1) for own in (moved, by_shared, *shifts))
         for (effect, shape), (columns, changes, *shifted) in zip(chosen, zip(*split, strict=True), strict=True):
             pairs = [*zip(shifted, errors, strict=False)]
             of_score = _covariance_and_bias_of_score(problem.problem, series, columns, scatter, pairs)
-            signatures.append(_EffectSignature(effect, shape, columns, *of_score, changes))
+            by_name = dict(zip(placed.shared_parameters, changes, strict=True))
+            signatures.append(_EffectSignature(effect, shape, columns, *of_score, by_name))
     return residual, signatures
 
 
@@ -193,7 +196,9 @@ def _detectability(signature: _EffectSignature) -> CandidateDetectability:
     sizes = DETECTABLE_AMPLITUDE_Z * np.sqrt(np.maximum(variance, 0.0))
     sizes = np.where(np.diag(information) > 1e-16, sizes, np.inf)
     room = [np.abs(np.subtract(effect.prior_ranges[name], effect.neutral_values[name])).max() for name in names]
-    return CandidateDetectability(effect, dict(zip(names, sizes.tolist(), strict=True)), bool(np.any(sizes < room)))
+    hidden = {name: float(np.max(np.abs(own) * np.minimum(sizes, room))) for name, own in signature.changes.items()}
+    found = dict(zip(names, sizes.tolist(), strict=True))
+    return CandidateDetectability(effect, found, bool(np.any(sizes < room)), hidden)
 
 
 def _pinv(matrix: Array) -> Array:
@@ -227,8 +232,8 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Output
     if room[0].tolist() == [0.0]:
         statistic, p_value = (statistic, p_value / 2) if step[0] > 0 else (0.0, 1.0)
     values = _values(effect, step) | signature.shape_values
-    changes = (signature.base_changes @ step).tolist()
-    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, tuple(changes))
+    changes = {name: float(own @ step) for name, own in signature.changes.items()}
+    return ScoreTestResult(effect, values, max(decrease, 0.0), statistic, p_value, changes)
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
@@ -346,8 +351,6 @@ def changes_by_candidates_at_location(
     It is the candidate with the largest predicted decrease of r'r whose p-value is below `level`. Effects without one
     are left out.
     """
-    names = [name for effect in base for name in effect.parameters.names]
     significant = grouped((s.effect.location, s) for s in screened.candidate_scores if s.p_value < level)
-    best = {place: dict(zip(names, own[0].base_changes, strict=True)) for place, own in significant.items()}
-    changed = [effect for effect in base if effect.location in best]
-    return {name: best[effect.location][name] for effect in changed for name in effect.parameters.names}
+    changed = [effect for effect in base if effect.location in significant]
+    return {n: significant[effect.location][0].changes[n] for effect in changed for n in effect.parameters.names}

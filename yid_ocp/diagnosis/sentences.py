@@ -153,8 +153,22 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
-    lines = _said((p_value < limits.significance_level, f"{small} {needs}"))
+    lines = _said((p_value < limits.significance_level, f"{small} {needs}")) + _hidden_changes(result)
     return lines + _said((along < limits.gap_significance_level, narrow), (unseen, unseen_effects_sentence(unseen)))
+
+
+def _hidden_changes(result: DiagnosisResult) -> list[str]:
+    """A line on found parameters that would be wrong by more than 10 % beside an effect that is not detectable."""
+    fit, system, told = result.nominal_model, result.nominal_model.problem.system, list[tuple[float, str]]()
+    offsets = {f"{frame}.{axis}" for frame in system.mechanism.frames for axis in "xyz"}
+    for name in {*fit.problem.shared_parameters} - offsets:
+        changes = ((own.hidden_changes.get(name, 0.0), own.effect.label) for own in result.screening.detectability)
+        most, label = max(changes, default=(0.0, ""))
+        limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(fit.values[name])
+        change = f"{name} by up to {_short(most)} {system.parameters[name].unit}".removesuffix(" 1")
+        told += _said((fit.std[name] < limit < most, (limit / max(most, 1e-300), f"{change} ({label})")))
+    hidden = "But an effect that these recordings cannot show would change found values by more than 10 %"
+    return _said((told, f"{hidden}: {listed([text for _, text in sorted(told)], _MAX_NAMED)}."))
 
 
 def _named_locations(result: DiagnosisResult) -> list[GapLocation]:
