@@ -66,13 +66,13 @@ def outcome(p=0.5, chi2=1.0, degrees=100.0, windows=()) -> NullTestResult:
     return NullTestResult(chi2, degrees, p, tuple(windows))
 
 
-def signature(of: EffectBase, columns, noise=None, priors=0.0, **shapes: float) -> _EffectSignature:
+def signature(of: EffectBase, columns, noise=None, priors=0.0, changes=None, **shapes: float) -> _EffectSignature:
     """A signature; its noise is white unless given, and no stated priors contribute."""
     columns = np.asarray(columns, float)
     columns = columns[:, None] if columns.ndim == 1 else columns
     noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
     named = {f"{of.label}.{name}": value for name, value in shapes.items()}
-    made = (columns, noise, priors * np.ones_like(noise), np.zeros(len(noise)), np.zeros((0, columns.shape[1])))
+    made = (columns, noise, priors * np.ones_like(noise), np.zeros(len(noise)), changes or {})
     return _EffectSignature(of, named, *made)
 
 
@@ -95,8 +95,8 @@ def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> Scor
     return ScoreTestResult(of, values, decrease, statistic, p)
 
 
-def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
-    return CandidateDetectability(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen)
+def visible(of: EffectBase, seen=True, detectable=0.1, **hidden: float) -> CandidateDetectability:
+    return CandidateDetectability(of, dict.fromkeys(of.amplitude_parameter_names, detectable), seen, hidden)
 
 
 def alike(labels: Sequence[str], matrix) -> ScreeningResult:
@@ -131,7 +131,8 @@ def costing(cost: float, rows: int) -> Evaluation:
 
 def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
-    system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names})
+    parameters = {name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names}
+    system = SimpleNamespace(parameters=parameters, mechanism=SimpleNamespace(frames={"tip": None}))
     options = SimpleNamespace(divided_links_model=None)
     return SimpleNamespace(
         has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options

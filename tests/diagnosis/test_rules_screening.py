@@ -179,8 +179,9 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    found = detectable(signature(of, columns, noise))
+    found = detectable(signature(of, columns, noise, changes={"k": np.array([-3.0])}))
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
+    assert found.hidden_changes == {"k": pytest.approx(3 * min(size, max(map(abs, expected))))}
     assert found.is_detectable is seen
 
 

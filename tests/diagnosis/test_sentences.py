@@ -27,6 +27,7 @@ from factories import (
     loss,
     outcome,
     place,
+    problem_of,
     score,
     screening,
     smoothed,
@@ -82,6 +83,10 @@ def gaps():
         yield f"no gap, p = {p} and chi2 {size}", finding("no_gap", **tests, **seen, **NO_EFFECT)
     quiet = {"nominal_test": outcome(0.2, chi2=1.02), "nominal_held_out_test": outcome(0.6, chi2=0.989)}
     yield "along a candidate alone", finding(**quiet)
+    own = problem_of("k", "damping", "weak", "tip.x")
+    known = fit(values={"k": 2.0, "damping": 5.0, "weak": 0.02, "tip.x": 0.1}, problem=own)
+    seen = [visible(FRICTION, k=0.21, damping=0.4), visible(OFFSET, k=0.5, weak=9.0, damping=0.51, **{"tip.x": 9.0})]
+    yield "no gap, hidden changes", finding("no_gap", nominal_model=known, screening=screening(seen=seen), **NO_EFFECT)
     yield "no gap", finding("no_gap", next_experiment="None is needed for these motions.", **NO_EFFECT)
 
 
@@ -195,9 +200,7 @@ def all_told(made) -> str:
 def said() -> dict[str, str]:
     """Every text by its case."""
     found = {
-        f"{part.__name__}: {name}": all_told(made)
-        for part in (gaps, places, effects, unknown)
-        for name, made in part()
+        f"{part.__name__}: {name}": all_told(made) for part in (gaps, places, effects, unknown) for name, made in part()
     }
     for verdict, where, unseen in [
         ("insufficient_data", (), ()), ("unknown", (place("T2"),), ()), ("unknown", (place("world", 0.8),), ()),
