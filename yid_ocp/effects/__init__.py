@@ -74,8 +74,8 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
 
     `system` does not contain the candidate effects. `recorded_sensors` lists the recorded signals: names in
     `signal_kinds_required_by_any_effect`, sensors on a frame such as `wrist:FRAME`, and `points:GROUP` for points with
-    a separate clock. Effects on prescribed joints are omitted if no effort was recorded, because they would change no
-    measurement. Raises `ModelError` for another signal.
+    a separate clock. Without recorded efforts, effects on prescribed joints change no measurement and are omitted,
+    except errors of their encoders, which move the whole arm. Raises `ModelError` for another signal.
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     named = sorted(name for name in present if ":" not in name)
@@ -90,5 +90,5 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
                 places = [place for place in places if place in present]
             if cls.is_at_point_groups:
                 places += [name.removeprefix("points:") for name in sorted(present) if name.startswith("points:")]
-            found += [(kind, place) for place in places if place not in unseen]
+            found += [(kind, place) for place in places if cls.moves_prescribed_joint or place not in unseen]
     return found

@@ -77,6 +77,7 @@ class _EncoderOffset(_DistortedReading):
 
     equation = "measured angle = true + offset"
     required_excitation = "the orientation to gravity"
+    moves_prescribed_joint = True
     possible_locations = _recorded_joints
     declared_parameters = (ParameterDefinition("offset", "rad", 0.0, -0.3, 0.3, (-0.035, 0.035), "measured - true"),)
 

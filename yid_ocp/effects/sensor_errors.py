@@ -16,7 +16,7 @@ from yid_ocp.model.system import NodeStateSymbols, System
 
 
 def _camera(system: System) -> tuple[str, ...]:
-    return ("camera",) if system.point_frames else ()
+    return ("camera",)
 
 
 class _CameraEffect(EffectBase):
