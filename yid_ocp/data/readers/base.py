@@ -60,6 +60,7 @@ MOTOR_CURRENT_UNITS = ("A", "mA")  # units of `effort` for motor currents
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
 _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
+_MIN_LARGE_FRACTION = 0.01  # of the samples, which look like degrees; fewer large ones are wrong samples
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
@@ -219,11 +220,11 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
     """Guess the units of values that cannot be in SI units. Returns units by quantity, and the reasons as sentences."""
     units, notes, joints = dict[str, str](), list[str](), recording.joints
     if joints is not None and joints.position.size:
-        largest, limit = np.nanmax(np.abs(joints.position), axis=0, initial=0.0), _MAX_PLAUSIBLE_VALUES["position"]
-        if (widest := float(largest.max())) > limit:
-            units["position"], j = "deg", int(largest.argmax())
-            many = f"{np.sum(np.abs(joints.position[:, j]) > limit)} of {len(joints.t)} samples exceed {limit:.2g} rad"
-            notes.append(f"{joints.names[j]} would reach {widest:.3g} rad ({many}), so angles seem to be in degrees")
+        counts = np.sum(np.abs(joints.position) > (limit := _MAX_PLAUSIBLE_VALUES["position"]), axis=0)
+        if counts.max() > _MIN_LARGE_FRACTION * len(joints.t):
+            units["position"], j = "deg", int(counts.argmax())
+            many = f"{counts[j]} of {len(joints.t)} samples of {joints.names[j]} would exceed {limit:.2g} rad"
+            notes.append(f"{many}, so angles seem to be in degrees")
     farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
     if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
