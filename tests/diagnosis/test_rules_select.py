@@ -268,11 +268,11 @@ class Rounds:
         kinds = "".join(sorted(of.kind for of in effects))
         return None if kinds in self.fails else self.fit(effects)
 
-    def compose(self, moved=False, is_late=False, **limits):
+    def compose(self, moved=False, is_late=False, far=False, **limits):
         self.thresholds, self.is_late = Thresholds(**limits), is_late
         problem = SimpleNamespace(has_process_noise=self.noisy)
         nominal = fit((), loss(*self.losses[""]), self.cost, {"k": 0.0}, problem=problem)
-        first, added, self.model_error_std = select.select_effects(self, nominal, self.screened(), moved=moved)
+        first, added, self.model_error_std = select.select_effects(self, nominal, self.screened(), moved, far)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 
@@ -292,7 +292,10 @@ def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypa
     rounds = Rounds(monkeypatch, losses, before={}, left=1e-3)
     first, chosen, _ = rounds.compose(moved=True, is_late=True)
     assert (first, chosen) == (["a", "b", "c"], ["a"])
-    assert [("earlier run" in text, "beside a@x" in text) for text in rounds.skipped] == [(True, False), (False, True)]
+    assert [("initial values" in text, "beside a@x" in text) for text in rounds.skipped] == [
+        (True, False),
+        (False, True),
+    ]
     assert rounds.screens == []
 
 
@@ -336,6 +339,14 @@ def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too
     assert added[0].refitted_model.values["k"] == 7.0
     # once an effect is in, and where the earlier run's model does not run, nothing is tried from there
     assert Rounds(monkeypatch, losses).compose(moved=True)[1] == ["a"]
+
+
+@cases("left, chosen", {"a gap": (2.0, "b"), "noise": (1.0, "a")})
+def test_a_nominal_fit_far_from_its_start_is_no_start_for_effects_that_leave_a_gap(monkeypatch, left, chosen):
+    losses = {"": (3.0, 3.2), "a": (left, left + 0.1), "b": (2.5, 2.7), "c": (2.6, 2.8)}
+    rounds = Rounds(monkeypatch, losses, before={"b": (1.0, 1.1)}, left=1e-3, cost=200.0)
+    assert rounds.compose(far=True, min_log_bayes_factor=10.0)[1] == [chosen]
+    assert len(rounds.refits) == (2 if chosen == "b" else 1)
 
 
 GROWING = {"": 5.0, "a": 3.0, "b": 4.0, "c": 4.5, "ab": 1.8, "ac": 2.1, "abc": 1.3, "bc": 3.5}

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import factories as f
@@ -9,6 +10,7 @@ import pytest
 from factories import added, cases, closed, effect, fit
 
 from yid_ocp.diagnosis import verdict as verdict_module
+from yid_ocp.diagnosis.diagnose import _has_left_start
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -352,3 +354,20 @@ def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, bloc
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
     assert judgement([added(SPRING)], search=search).transfer_checks == ()
     assert bool(asked) is not blocks
+
+
+@cases(
+    "k, prior, far",
+    {
+        "near": (5.9, 9.9, False), "too stiff": (6.1, 0.0, True), "too soft": (0.6, 0.0, True),
+        "beside a prior": (2.0, -10.1, True),
+    },
+)  # fmt: skip
+def test_a_fit_far_from_its_initial_values_or_priors_is_no_start_for_others(k, prior, far):
+    """Residuals of priors count in stated stds; a value that begins at zero has no ratio."""
+    initial = SimpleNamespace(named_values=lambda _: {"k": 2.0, "tip.x": 0.0})
+    rows, options = SimpleNamespace(stated_priors=slice(1, 2)), SimpleNamespace(stated_std_factor=2.0)
+    names = {"shared_parameters": ("k", "tip.x"), "initial_unknowns": None}
+    problem = SimpleNamespace(residual_rows=rows, options=options, unknowns=initial, **names)
+    model = fit(values={"k": k, "tip.x": 0.3}, problem=problem)
+    assert _has_left_start(replace(model, evaluation=f.evaluation([99.0, prior]))) is far

@@ -440,6 +440,7 @@ def diagnosis_evidence_to_dict(result: DiagnosisResult) -> dict[str, Any]:
         "screening": _screening_to_json(result.screening),
         "has_left_baseline": result.has_left_baseline,
         "discretisation_chi2": result.discretisation_chi2,
+        "has_left_start": result.has_left_start,
         "thresholds": plain(result.thresholds),
         "located_gap": {"locations": plain(located)},
         "remaining": [plain(place) for place in result.remaining_gap_locations],
@@ -482,7 +483,7 @@ class _RecordedCase:
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        other = (data[name] for name in ("has_left_baseline", "discretisation_chi2"))
+        other = (data.get(name, False) for name in ("has_left_baseline", "discretisation_chi2", "has_left_start"))
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *other)
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},

@@ -49,6 +49,7 @@ _LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
+_FAR_RATIO, _FAR_IN_STDS = 3.0, 5.0  # of an estimate to its initial value, or from a prior's mean
 _NEGLIGIBLE_MOVE_IN_STDS = 0.1  # largest change of an estimate that does not change which events are found
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
@@ -155,7 +156,8 @@ def _examined(
     nominal = replace(nominal, held_out_loss=null_test.held_out_loss(own, nominal.unknowns, factor, spread, predicted))
     del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
-    evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT, discretisation_chi2=least)
+    has_left, none_yet = _has_left_start(nominal), EMPTY_SCREENING_RESULT
+    evidence = NominalModelGapEvidence(nominal, test, held_out_test, none_yet, False, least, has_left)
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
     search.progress.begin_stage(f"screening {count_with_noun(len(effects), 'candidate effect')}", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
@@ -171,6 +173,16 @@ def _examined(
     if not seen.evidence.warrants_effect_search(limits):
         return seen
     return _at_finer_discretisation(seen, nominal, screened.largest_predicted_chi2_decrease)
+
+
+def _has_left_start(fit: RefittedModel) -> bool:
+    """Check whether a fit contradicts priors, or an estimate is far from its initial value, so not a good start."""
+    problem, rows = fit.problem, fit.problem.residual_rows.stated_priors
+    deviations = fit.evaluation.residual[rows] / problem.options.stated_std_factor
+    initial = problem.unknowns.named_values(problem.initial_unknowns)
+    ratios = [fit.values[name] / initial[name] for name in problem.shared_parameters if initial[name] > 0]
+    is_far = any(not 1 / _FAR_RATIO < ratio < _FAR_RATIO for ratio in ratios)
+    return is_far or float(np.max(np.abs(deviations), initial=0.0)) > _FAR_IN_STDS
 
 
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is_refitted: bool = False) -> _Examined:

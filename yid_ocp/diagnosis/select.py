@@ -157,20 +157,22 @@ def _refit_shortlist(screened: ScreeningResult, limits: Thresholds) -> list[Effe
 
 
 def select_effects(
-    search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False
+    search: RefitContext, nominal: RefitStatistics, screened: ScreeningResult, moved: bool = False, far: bool = False
 ) -> tuple[tuple[RefitStatistics, ...], tuple[SelectedEffect, ...], dict[str, float]]:
     """Add effects one by one to close the held-out gap, then try to replace and remove each of them.
 
-    If `moved` (the nominal fit has left the estimates of an earlier run), candidates are also tried from those
-    estimates. Returns the fits of single effects in the first round, the selected effects, and by effect parameter the
-    std of what further effects may contribute to it. The fit of the chosen effect comes first (its last fit if no other
-    effect is selected), then all other fits by held-out loss.
+    Candidates are also tried from the initial values if `moved` (the nominal fit has left the estimates of an earlier
+    run, which are these values), or if it is `far` from them and no candidate leaves only noise. Returns the fits of
+    single effects in the first round, the selected effects, and by effect parameter the std of what further effects may
+    contribute to it. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
+    other fits by held-out loss.
     """
     limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()
     fits = refit_with_each_effect(search, (), shortlist, nominal.values)
-    where = "from the earlier run's parameters"  # the nominal fit supplies missing ones
-    if moved and not search.is_skipped_past_deadline(f"candidates {where}"):
+    where = "from the initial values"
+    far = far and not any(_leaves_noise(fit, limits) for fit in fits)
+    if (moved or far) and not search.is_skipped_past_deadline(f"candidates {where}"):
         again = _refit_shortlist(search.screen((), {}, where), limits)
         fits = sorted([*fits, *refit_with_each_effect(search, (), again, {}, where)], key=lambda fit: -fit.cost)
     single = {fit.effects[0].label: fit for fit in fits}  # of two fits the one that costs less, which is the last

@@ -54,6 +54,7 @@ class NominalModelGapEvidence:
     screening: ScreeningResult
     has_left_baseline: bool = False  # whether parameters have left the estimates of an earlier run
     discretisation_chi2: float = 0.0  # r'r that a finer discretisation may still remove
+    has_left_start: bool = False  # whether the nominal fit is far from its initial values or contradicts priors
 
     def residual_exceeds_noise(self, limits: Thresholds) -> bool:
         """Check whether the residual as a whole exceeds noise by a relevant amount."""
@@ -137,7 +138,8 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
     limits, nominal = search.thresholds, evidence.nominal_model
     fits, added, beside = tuple[RefitStatistics, ...](), tuple[SelectedEffect, ...](), dict[str, float]()
     if evidence.warrants_effect_search(limits):
-        fits, added, beside = select_effects(search, nominal, evidence.screening, evidence.has_left_baseline)
+        has_left = evidence.has_left_baseline, evidence.has_left_start
+        fits, added, beside = select_effects(search, nominal, evidence.screening, *has_left)
     search.record_stage_end_time("refits")
 
     carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
