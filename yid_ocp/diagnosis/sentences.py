@@ -188,13 +188,9 @@ def _why_gap(result: DiagnosisResult) -> list[str]:
     removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
     low, high = (f"{100 * end:.3g}" for end in (total.ci_low, total.ci_high))
     interval = f" (95 % interval {low} to {high} %)" * (low != high)
-    unknown = f"{removed} an unknown part {of}"
-    is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
-    closed = _said(
-        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of}{interval}."),
-        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
-        (True, f"{unknown}."),
-    )[0]
+    unknown = f"{removed} an unknown part {of}, because the nominal model's error there is within noise."
+    known = f"{removed} {100 * total.fraction:.3g} % {of}{interval}."
+    closed = _said((math.isfinite(total.ci_low), known), (True, unknown))[0]
     sizes = [_named(entry.effect, added[-1].refitted_model, result.thresholds) for entry in added]
     return [where, closed, *sizes, *_remains(result)]
 
