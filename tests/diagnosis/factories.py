@@ -133,9 +133,8 @@ def problem_of(*names: str) -> SimpleNamespace:
     """The part of a problem that a result uses; its free parameters [N m/rad] have these names."""
     system = SimpleNamespace(parameters={name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names})
     options = SimpleNamespace(divided_links_model=None)
-    return SimpleNamespace(
-        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
-    )
+    rows, rest = SimpleNamespace(data=slice(0, 1), stated_priors=slice(1, 1)), {"system": system, "options": options}
+    return SimpleNamespace(has_process_noise=False, shared_parameters=names, held_out=(), residual_rows=rows, **rest)
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
@@ -148,8 +147,10 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
         e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_parameter_names] for e in effects
     }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
-    problem = problem_of() if problem is None else problem
-    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, evaluation([1.0]))
+    if problem is None:
+        problem = SimpleNamespace(**vars(problem_of()), unknown_names=tuple(values))
+    end = evaluation([1.0], np.ones((1, len(values))))
+    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, end)
     return RefittedModel(values, std, p_values, *rest)
 
 

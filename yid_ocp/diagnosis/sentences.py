@@ -277,8 +277,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     pairs, remedy = [], "To determine an effect, measure these parameters and fix them (parameters.NAME.free: false)."
     for fit in result.single_effect_models:
         assert isinstance(fit, RefittedModel)
-        if fit.evaluation.jacobian is None:
-            continue
+        assert fit.evaluation.jacobian is not None
         at, own = fit.problem.residual_rows, fit.effects[-1]
         data, priors = (fit.evaluation.jacobian[part] for part in (at.data, at.stated_priors))
         names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
