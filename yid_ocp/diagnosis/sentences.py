@@ -23,12 +23,10 @@ _MAX_NAMED = 5  # number of named parameters, the most significant changes first
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 _LONGER_SEARCH = "To try the rest, remove diagnosis.budget, or raise it."
-GAP_ORIGIN_TEXTS = {
+_ORIGIN_TEXTS = {
     "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
     "sensor": "a sensor, not the mechanics",
     "either": "the mechanics or the effort sensor (recorded efforts alone do not show which)",
-    "both": "both the mechanics and a sensor",
-    "none": "neither the mechanics nor a constant error of a sensor, as far as these unknowns can show",
 }
 
 
@@ -160,13 +158,14 @@ def _named_locations(result: DiagnosisResult) -> list[GapLocation]:
     return [place for place in result.gap_locations if place.gap_share >= MIN_GAP_SHARE][:_MAX_NAMED]
 
 
-def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
-    """Return a sentence on the gap's locations, with inseparable ones together, and if `has_origin` on its origin."""
+def _gap_locations_sentences(result: DiagnosisResult) -> str:
+    """Sentences on the gap's locations, with inseparable ones together, and on its origin."""
     where = _named_locations(result)
     if not where:
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
-    origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
+    origin = _ORIGIN_TEXTS.get(result.smoother_result.plant_or_sensor_origin, "")
+    rest = 1 - sum(place.gap_share for place in where)
     groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
     words = {group: f"the readings of {group}" for group in groups}
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
@@ -174,14 +173,13 @@ def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False)
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     rivals = {name for p in where if p.indistinguishable_from for name in (p.location, *p.indistinguishable_from)}
     is_unsure = bool(rivals & {*groups, "camera", "clock"})  # whether a place or a sensor
-    is_told = has_origin and not is_unsure and origin in ("plant", "sensor", "either")
-    side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
+    side = _said((origin and not is_unsure, f" Its origin is {origin}."))
     return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on where a gap lies, on the selected effects, and on the error that is left."""
-    added, where = result.selected_effects, gap_locations_sentence(result, has_origin=True)
+    added, where = result.selected_effects, _gap_locations_sentences(result)
     if not added:
         return [where, *_remains(result)]
     names, total = listed([entry.effect.label for entry in added]), added[-1].cumulative_closure
