@@ -257,11 +257,11 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
 def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
     """Return the assumed model error of all coordinates' torques, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
-    terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
+    size, rate, held = torques.torque_magnitude_rate_and_static_friction(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # the time of a torque is known to one sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    return np.hypot(_INVERSE_DYNAMICS_RTOL * terms.rss_torque, late * terms.torque_rate), terms.static_friction_limit
+    return np.hypot(_INVERSE_DYNAMICS_RTOL * size, late * rate), held
 
 
 def _read_forces(
