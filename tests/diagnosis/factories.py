@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
-from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, HeldOutGapClosure, HeldOutLoss, NullTestResult
+from yid_ocp.inference.null_test import HeldOutGapClosure, HeldOutLoss, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedDisturbances, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -222,7 +222,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
     alone = fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})
     usual = {
         "verdict": verdict,
-        "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001),),
+        "noise_floor": {"points.tip": 0.001},
         "nominal_test": outcome(p=0.3, chi2=1.02) if verdict == "no_gap" else outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=0.6, chi2=0.99) if verdict == "no_gap" else outcome(p=1e-8, chi2=2.1),
         "screening": screening([score(of, p=0.3 if verdict == "no_gap" else 1e-9, decrease=100.0, statistic=40.0)]),

@@ -14,7 +14,7 @@ from small_problems import PENDULUM, H, pendulum_step, taken
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
     NullTestResult,
-    assumed_channel_noise_levels,
+    assumed_noise_rmse_by_channel,
     benjamini_hochberg_mask,
     channels_with_residual_indices,
     residual_chi2_null_test,
@@ -559,11 +559,11 @@ def test_the_noise_floor_is_the_median_of_each_channel():
     nan = math.nan
     first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
     second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
-    episodes = [SimpleNamespace(measurements=[own]) for own in (first, second)]
+    seen = samples(["camera.w"], [[2.0, 2.0, 2.0]], width=3)
+    episodes = [SimpleNamespace(measurements=own) for own in ([first, seen], [second])]
     problem = SimpleNamespace(episodes=episodes[:1], held_out=episodes[1:])
-    found = {entry.channel: entry for entry in assumed_channel_noise_levels(problem)}
-    assert set(found) == {"points.a", "points.b"}
-    assert (found["points.a"].noise_std, found["points.b"].noise_std, found["points.b"].unit) == (3.0, 9.0, "m")
+    distance = {"camera.w": math.sqrt(3) * 2.0}
+    assert assumed_noise_rmse_by_channel(problem) == {"points.a": 3.0, "points.b": 9.0} | distance
 
 
 @pytest.mark.parametrize(("own_part", "named"), [(0.0, [1, 2]), (1.0, [])])

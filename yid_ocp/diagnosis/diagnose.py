@@ -406,7 +406,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
-        noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
+        noise_floor=null_test.assumed_noise_rmse_by_channel(nominal.problem),
         record=search.record,
         smoother_result=smoothed,
         gap_locations=where,

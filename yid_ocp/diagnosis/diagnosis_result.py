@@ -34,7 +34,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     of nd unknown forces [N m or N], offsets and biases [m] in J time intervals.
     """
 
-    noise_floor: tuple[null_test.AssumedChannelNoiseLevel, ...]  # error from noise alone, in the channel's unit
+    noise_floor: Mapping[str, float]  # rms error from noise alone by channel, in the channel's unit
     smoother_result: SmoothedUnknownsResult | None  # None if there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
@@ -95,7 +95,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
         problem = self.nominal_model.problem
-        noise = {} if problem.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
+        noise = {} if problem.has_process_noise else self.noise_floor
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
         held_out = [episode.name for episode in problem.held_out]
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}

@@ -42,7 +42,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         wider = f"Record a motion in which {aspects[0]}{at} varies over a wider range."
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
-    still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
+    still = {*_IMMOVABLE_LOCATIONS, *(channel.rpartition(".")[0] for channel in result.noise_floor)}  # also sensors
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
     movable = ", ".join([name for name in first if name not in still])
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
@@ -166,7 +166,7 @@ def _gap_locations_sentences(result: DiagnosisResult) -> str:
     assert result.smoother_result is not None  # it found the locations
     origin = _ORIGIN_TEXTS.get(result.smoother_result.plant_or_sensor_origin, "")
     rest = 1 - sum(place.gap_share for place in where)
-    groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
+    groups = {channel.rpartition(".")[0] for channel in result.noise_floor}
     words = {group: f"the readings of {group}" for group in groups}
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
     named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
@@ -221,8 +221,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     fitted, problem = result.nominal_model.values, result.nominal_model.problem
     divided = problem.options.divided_links_model
     more_links = listed(divided.settings) if divided else ""
-    predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
-    tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
+    channels = result.nominal_model.held_out_loss.channel_rmse, result.noise_floor
+    tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in channels)
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
     free = [(name, problem.system.parameters[name]) for name in problem.shared_parameters if fitted[name] != 0]
@@ -299,7 +299,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
 
 def _remains(result: DiagnosisResult) -> list[str]:
     """Sentences on the error that remains on held-out motions, and on what the effects change in the model."""
-    noise = {own.channel: own.noise_rmse for own in result.noise_floor}
+    noise = result.noise_floor
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     shown = {"m": (1e3, "mm")}

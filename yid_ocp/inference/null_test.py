@@ -48,21 +48,6 @@ class OutputResidualIndices:
 
 
 @dataclass(frozen=True)
-class AssumedChannelNoiseLevel:
-    """The noise standard deviation that a problem assumes for one channel (the median over its samples)."""
-
-    channel: str
-    unit: str
-    noise_std: float
-    outputs_per_channel: int = 1  # coordinates of a point
-
-    @property
-    def noise_rmse(self) -> float:
-        """The root mean square error that noise alone causes. For points it is that of a distance."""
-        return math.sqrt(self.outputs_per_channel) * self.noise_std
-
-
-@dataclass(frozen=True)
 class _ResidualWindow:
     """Test of one channel in a time window [s]. It is flagged if noise alone does not explain r'r in the window."""
 
@@ -83,17 +68,19 @@ class NullTestResult:
     windows: tuple[_ResidualWindow, ...]
 
 
-def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Return the noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
-    found, told = dict[str, list[Array]](), dict[str, tuple[str, int]]()
+def assumed_noise_rmse_by_channel(problem: EstimationProblem) -> dict[str, float]:
+    """Return the root mean square error that the stated noise alone causes in each channel, in the channel's unit.
+
+    It follows from the median std of the channel's samples. For points it is that of a distance.
+    """
+    found, outputs = dict[str, list[Array]](), dict[str, int]()
     for episode in (*problem.episodes, *problem.held_out):
         for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
-                told[channel] = samples.sensor.unit, samples.sensor.outputs_per_channel
+                outputs[channel] = samples.sensor.outputs_per_channel
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
-    medians = {channel: float(np.median(values)) for channel, values in joined.items() if len(values)}
-    return tuple(AssumedChannelNoiseLevel(c, told[c][0], median, told[c][1]) for c, median in medians.items())
+    return {name: math.sqrt(outputs[name]) * float(np.median(std)) for name, std in joined.items() if len(std)}
 
 
 def _variance_inflation(autocorrelation: Array) -> float:

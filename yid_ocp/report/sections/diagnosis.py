@@ -59,7 +59,7 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     changed = bool(finding.accepted_effects)
-    floor, rows = {own.channel: own.noise_rmse for own in finding.noise_floor}, []
+    floor, rows = finding.noise_floor, []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
         extended = after[channel][0] if changed and channel in after else None
