@@ -165,7 +165,7 @@ def find_events(
         return NO_EVENTS, None
     series, level = null_test.channels_with_residual_indices(judged), limits.significance_level
     test = null_test.residual_chi2_null_test(series, tested.residual, len(fit.values), level)
-    is_flagged = any(window.is_flagged for window in test.windows)
+    is_flagged = bool(test.flagged_windows)
     evaluation = tested
     if (is_flagged and not has_same_data) or own.has_process_noise:
         evaluation = own.evaluate(x, is_flagged, guesses)
