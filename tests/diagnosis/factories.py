@@ -161,7 +161,9 @@ def closed(value=0.9, low=0.8, high=0.95) -> HeldOutGapClosure:
 def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=None) -> SelectedEffect:
     """An effect that was added; it is the first of its rivals."""
     fitted = fitted or fit([of], values=dict.fromkeys(of.amplitude_parameter_names, 0.5))
-    return SelectedEffect(of, fitted, part or closed(), (of, *rivals), (1.0,) + (0.0,) * len(rivals))
+    return SelectedEffect(
+        of, fitted, part or closed(), (of, *rivals), dict.fromkeys([r.label for r in rivals], 0.0) | {of.label: 1.0}
+    )
 
 
 def carried(of: EffectBase, values=(0.5, 0.9), stds=(0.01, 0.02)) -> EffectAmplitudeTransferCheck:
