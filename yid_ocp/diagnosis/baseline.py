@@ -325,8 +325,7 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
 
 
 def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
-    if problem.has_process_noise:
-        problem = problem_with_sensor_noise_only(problem)
+    problem = problem_with_sensor_noise_only(problem)
     found = problem.predict_held_out(problem.pack_unknowns({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:

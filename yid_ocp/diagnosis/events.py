@@ -31,7 +31,7 @@ from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.errors import SolverError
-from yid_ocp.files import attributes_to_dict, to_json_types
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import null_test
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, excess_over_sample_count, times_since_recording_start
 from yid_ocp.inference.smoother import (
@@ -99,7 +99,7 @@ class ForceOrFaultEvent:
     def to_dict(self) -> dict[str, Any]:
         """Convert the event to an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
-        return dict(to_json_types(attributes_to_dict(self, f"{names} std=impulse_std")))
+        return attributes_to_dict(self, f"{names} std=impulse_std")
 
 
 @dataclass(frozen=True)
