@@ -49,7 +49,7 @@ def main() -> None:
             planned = PlannedBlindCase(number, given.experiment, given.category, given.multiple, given.brisk)
             case, label = ensemble.draw_recordings_and_ground_truth(planned)
             begun = time.process_time()
-            found = diagnose_unlabelled_case(ensemble, case, "all", run.diagnosis)
+            found = diagnose_unlabelled_case(ensemble, case, run.diagnosis)
             sets = (" or ".join(e.label for e in own.equivalent_effects) for own in found.accepted_selected_effects)
             sizes = f"{found.nominal_test.chi2_per_dof:.3g} | {found.nominal_held_out_test.chi2_per_dof:.3g}"
             injected, named = ", ".join(e.label for e in label.injected) or "-", "; ".join(sets) or "-"

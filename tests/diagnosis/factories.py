@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
-from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, HeldOutGapClosure, HeldOutLoss, NullTestResult
+from yid_ocp.inference.null_test import HeldOutGapClosure, HeldOutLoss, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedDisturbances, SmoothedUnknownsResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -134,9 +134,8 @@ def problem_of(*names: str) -> SimpleNamespace:
     parameters = {name: SimpleNamespace(unit="N m/rad", lower=0.0, upper=9.0) for name in names}
     system = SimpleNamespace(parameters=parameters, mechanism=SimpleNamespace(frames={"tip": None}))
     options = SimpleNamespace(divided_links_model=None)
-    return SimpleNamespace(
-        has_process_noise=False, shared_parameters=names, system=system, held_out=(), options=options
-    )
+    rows, rest = SimpleNamespace(data=slice(0, 1), stated_priors=slice(1, 1)), {"system": system, "options": options}
+    return SimpleNamespace(has_process_noise=False, shared_parameters=names, held_out=(), residual_rows=rows, **rest)
 
 
 def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
@@ -149,8 +148,10 @@ def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, he
         e.label: [(values[n] - neutral[n]) / (held[n] or 1e-9) for n in e.amplitude_parameter_names] for e in effects
     }
     p_values = {label: float(scipy.special.chdtrc(len(z), np.square(z).sum())) for label, z in sizes.items()}
-    problem = problem_of() if problem is None else problem
-    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, evaluation([1.0]))
+    if problem is None:
+        problem = SimpleNamespace(**vars(problem_of()), unknown_names=tuple(values))
+    end = evaluation([1.0], np.ones((1, len(values))))
+    rest = (tuple(effects), cost, loss(1.0, 1.0) if lost is None else lost, 1, problem, end)
     return RefittedModel(values, std, p_values, *rest)
 
 
@@ -161,7 +162,9 @@ def closed(value=0.9, low=0.8, high=0.95) -> HeldOutGapClosure:
 def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=None) -> SelectedEffect:
     """An effect that was added; it is the first of its rivals."""
     fitted = fitted or fit([of], values=dict.fromkeys(of.amplitude_parameter_names, 0.5))
-    return SelectedEffect(of, fitted, part or closed(), (of, *rivals), (1.0,) + (0.0,) * len(rivals))
+    return SelectedEffect(
+        of, fitted, part or closed(), (of, *rivals), dict.fromkeys([r.label for r in rivals], 0.0) | {of.label: 1.0}
+    )
 
 
 def carried(of: EffectBase, values=(0.5, 0.9), stds=(0.01, 0.02)) -> EffectAmplitudeTransferCheck:
@@ -222,7 +225,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
     alone = fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})
     usual = {
         "verdict": verdict,
-        "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001),),
+        "noise_floor": {"points.tip": 0.001},
         "nominal_test": outcome(p=0.3, chi2=1.02) if verdict == "no_gap" else outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=0.6, chi2=0.99) if verdict == "no_gap" else outcome(p=1e-8, chi2=2.1),
         "screening": screening([score(of, p=0.3 if verdict == "no_gap" else 1e-9, decrease=100.0, statistic=40.0)]),

@@ -287,7 +287,7 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     monkeypatch.setattr(blind, "AllCandidatesProblem", SimpleNamespace(from_problem=composed_from))
     monkeypatch.setattr(blind, "fit_nominal_model", lambda *_: nominal)
     monkeypatch.setattr(blind, "refit_with_effects", refit)
-    ensemble = SimpleNamespace(_nominal_problem=lambda recording: SimpleNamespace(system="system"))
+    ensemble = SimpleNamespace(candidates="all", _nominal_problem=lambda _: SimpleNamespace(system="system"))
     case, told = UnlabelledCase("c", "estimate", "held out", ()), CaseGroundTruth("c", "single", injected, 1.0, {})
     assert blind.true_effects_gap_closure(ensemble, case, told) == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}

@@ -9,7 +9,6 @@ import pytest
 
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.verdict import Judgement
-from yid_ocp.inference.null_test import AssumedChannelNoiseLevel
 
 FRICTION, OFFSET = f.effect("friction@elbow"), f.effect("offset@wrist", f.amplitude(lower=-9.0))
 
@@ -41,16 +40,12 @@ rival_changes"""
 
 def test_model_error_is_the_largest_error_beyond_noise_of_each_unit():
     errors = {"points.tip": (0.03, "m"), "points.end": (0.02, "m"), "joints.effort.elbow": (0.5, "N m")}
-    levels = (("points.tip", "m", 0.0169, 3), ("points.end", "m", 0.001, 3), ("joints.effort.elbow", "N m", 0.6, 1))
-    made = f.finding(
-        "unknown",
-        nominal_model=f.fit(lost=f.loss(2.0, channels=errors)),
-        noise_floor=tuple(AssumedChannelNoiseLevel(*own) for own in levels),
-    )
+    noise = {"points.tip": math.sqrt(3) * 0.0169, "points.end": math.sqrt(3) * 0.001, "joints.effort.elbow": 0.6}
+    made = f.finding("unknown", nominal_model=f.fit(lost=f.loss(2.0, channels=errors)), noise_floor=noise)
     size = math.sqrt(0.02**2 - 3 * 0.001**2)
     sizes = f"{1e3 * size:.2g} mm at points.end (rms, noise subtracted)."
     assert f"error of the nominal model is {sizes}" in diagnosis_summary_text(made)  # noise alone gives the torque's
-    made = replace(made, noise_floor=tuple(AssumedChannelNoiseLevel(own[0], own[1], 1.0, own[3]) for own in levels))
+    made = replace(made, noise_floor=dict.fromkeys(noise, 1.0))
     assert "nominal model is 0 N m at joints.effort.elbow, 0 mm at points.tip" in diagnosis_summary_text(made)
 
 

@@ -595,12 +595,12 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     _, chosen, added = Rounds(monkeypatch, losses).compose(max_effects=2)
     assert chosen == ["a", "b"]
     assert [of.kind for of in added[0].equivalent_effects] == ["a", "c"]
-    assert sum(added[0].shares) == pytest.approx(1.0)
-    assert added[0].shares[0] > added[0].shares[1] > 0.1, "the nearer, the likelier"
+    assert sum(added[0].shares.values()) == pytest.approx(1.0)
+    assert added[0].shares["a@x"] > added[0].shares["c@x"] > 0.1, "the nearer, the likelier"
     rivals = [(effect("b@x"), 0.8), (effect("c@x"), 0.3)]
     effects, shares = select._equivalents_and_shares(effect("a@x"), rivals)
     assert [of.kind for of in effects] == ["a", "c"], "what is unlikely is not named"
-    assert shares == pytest.approx((0.8055, 0.1797), abs=1e-4)
+    assert shares == pytest.approx({"a@x": 0.8055, "c@x": 0.1797}, abs=1e-4)
 
 
 @pytest.mark.parametrize(("std", "there"), [(0.499, True), (0.51, False)])

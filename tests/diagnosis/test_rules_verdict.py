@@ -161,7 +161,7 @@ def test_the_more_is_explained_the_surer_are_effects_and_several_must_explain_mo
 
 def test_equivalent_effects_share_the_probability_of_their_set():
     last, seen = fit([ONE, THIRD]), f.screening([f.score(own) for own in (ONE, OTHER, THIRD)])
-    chosen = (replace(added(ONE, [OTHER], last), shares=(0.7, 0.3)), added(THIRD, fitted=last))
+    chosen = (replace(added(ONE, [OTHER], last), shares={ONE.label: 0.7, OTHER.label: 0.3}), added(THIRD, fitted=last))
     told = f.finding("confusable", selected_effects=chosen, single_effect_models=(), screening=seen).to_dict()["which"]
     wanted = {ONE.kind: 0.63, OTHER.kind: 0.27, THIRD.kind: 0.9}
     assert {own["kind"]: own["probability"] for own in told} == pytest.approx(wanted)

@@ -182,7 +182,7 @@ def compared():
     for name, (moved, shared, is_explained) in {
         "nothing changed": (False, 0.5, True), "one changed": (True, 0.5, True), "runs differ": (True, 1e-3, False),
     }.items():  # fmt: skip
-        shift = ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, 1e-9, moved)
+        shift = ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, moved)
         earlier = ParameterShiftsSinceBaseline(is_explained, shared, (shift,))
         yield name, finding("no_gap", baseline_comparison=earlier, **NO_EFFECT)
     errors = [{"points.tip": (error, "m")} for error in (0.02, 0.01)]

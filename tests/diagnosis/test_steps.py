@@ -106,9 +106,9 @@ def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_n
 
 def test_torques_at_a_node_do_not_depend_on_how_often_it_is_asked(screened):
     own, run = screened[1].problem, screened[1].evaluation.episode_predictions[0].rollout
-    read = CompiledInverseDynamics(own.step).inverse_dynamics_term_magnitudes
-    once, twice = (vars(read(own.theta, run, np.array(nodes))) for nodes in ([1, 4, 9], [1, 4, 4, 9]))
-    assert all(np.array_equal(once[name][[0, 1, 1, 2]], twice[name]) for name in once)
+    read = CompiledInverseDynamics(own.step).torque_magnitude_rate_and_static_friction
+    once, twice = (read(own.theta, run, np.array(nodes)) for nodes in ([1, 4, 9], [1, 4, 4, 9]))
+    assert all(np.array_equal(one[[0, 1, 1, 2]], two) for one, two in zip(once, twice, strict=True))
 
 
 @pytest.mark.parametrize(("lean", "chosen"), [(0.0, 0), (1e-10, 0), (0.01, 1)])

@@ -14,7 +14,7 @@ from small_problems import PENDULUM, H, pendulum_step, taken
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
     NullTestResult,
-    assumed_channel_noise_levels,
+    assumed_noise_rmse_by_channel,
     benjamini_hochberg_mask,
     channels_with_residual_indices,
     residual_chi2_null_test,
@@ -529,9 +529,8 @@ RATES = [(0.1, (0.02, 0.5, 0.6, 0.7), (0,)), (0.05, (0.02, 0.5, 0.6, 0.7), ())]
 
 @pytest.mark.parametrize(("level", "p_values", "flagged"), [*((0.01, *case) for case in (*few, *SOME, ALL)), *RATES])
 def test_windows_are_flagged_by_their_false_discovery_rate(level, p_values, flagged):
-    found = residual_chi2_null_test(*with_p_values(*p_values), 0, level=level).windows
-    assert len(found) == 4
-    assert tuple(i for i, entry in enumerate(found) if entry.is_flagged) == flagged
+    found = residual_chi2_null_test(*with_p_values(*p_values), 0, level=level).flagged_windows
+    assert found == tuple((0.5 * i, min(0.5 * (i + 1), 1.975)) for i in flagged)
 
 
 @pytest.mark.parametrize(("p_value", "tries", "expected"), [(0.04, 1.0, True), (0.06, 1.0, False), (0.04, 2.0, False)])
@@ -540,30 +539,28 @@ def test_one_test_is_judged_by_the_level_and_the_number_of_tries(p_value, tries,
 
 
 def test_columns_of_a_channel_share_windows_and_recordings_do_not():
-    residual = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    residual = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
     parts = [series([0, 1]), series([2, 3]), series([4], recording="second"), series([5], channel="points.other")]
-    found = residual_chi2_null_test(parts, residual, 0).windows
-    places = [("run", "points.tip"), ("second", "points.tip"), ("run", "points.other")]
-    assert [(w.recording, w.channel) for w in found] == places
+    assert len(residual_chi2_null_test(parts, residual, 0).flagged_windows) == 3
 
 
 def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():
     t = [0.0, 0.25, 0.5, 0.75, 1.0, 2.1]
     parts = [series(range(3), t[:3]), series([3, 4, 5], t[3:])]
     for length, expected in ((0.5, [(0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (2.0, 2.1)]), (3.0, [(0.0, 2.1)])):
-        found = residual_chi2_null_test(parts, np.ones(6), 0, window=length).windows
-        assert [(w.start_time, w.end_time) for w in found] == expected
+        found = residual_chi2_null_test(parts, np.full(6, 9.0), 0, window=length).flagged_windows
+        assert [*found] == expected
 
 
 def test_the_noise_floor_is_the_median_of_each_channel():
     nan = math.nan
     first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
     second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
-    episodes = [SimpleNamespace(measurements=[own]) for own in (first, second)]
+    seen = samples(["camera.w"], [[2.0, 2.0, 2.0]], width=3)
+    episodes = [SimpleNamespace(measurements=own) for own in ([first, seen], [second])]
     problem = SimpleNamespace(episodes=episodes[:1], held_out=episodes[1:])
-    found = {entry.channel: entry for entry in assumed_channel_noise_levels(problem)}
-    assert set(found) == {"points.a", "points.b"}
-    assert (found["points.a"].noise_std, found["points.b"].noise_std, found["points.b"].unit) == (3.0, 9.0, "m")
+    distance = {"camera.w": math.sqrt(3) * 2.0}
+    assert assumed_noise_rmse_by_channel(problem) == {"points.a": 3.0, "points.b": 9.0} | distance
 
 
 @pytest.mark.parametrize(("own_part", "named"), [(0.0, [1, 2]), (1.0, [])])

@@ -23,6 +23,7 @@ from yid_ocp.cli import main
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
+from yid_ocp.diagnosis.sentences import diagnosis_summary_text
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
@@ -265,7 +266,8 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
         (_Overspeed("run", "elbow", 1.5),),
         (ForceEstimate("run", "elbow", "elbow", "N m", t, pulse.filtered_force_at(t), np.eye(21), 0.1 + 0 * t, 0 * t),),
     )
-    page = page_of(replace(found["no_gap"], events=events), tmp_path)
+    finding = replace(found["no_gap"], events=events)
+    page = page_of(replace(finding, summary=diagnosis_summary_text(finding)), tmp_path)
     assert 'id="events"' in page
     text = text_of(page)
     assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text

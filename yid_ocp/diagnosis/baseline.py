@@ -52,7 +52,6 @@ class ParameterShift:
     current_value: float  # estimate from the recordings and, if it has a prior, the baseline
     current_std: float
     z_score: float | None  # shift in standard deviations; None if the recordings do not inform the parameter
-    p_value: float  # p-value of the shift if nothing changed
     has_changed: bool  # significant at the diagnosis' level, Bonferroni-corrected for the parameters
 
     @property
@@ -165,7 +164,7 @@ class EarlierRunsBaseline:
                 score = (now - float(value)) / math.sqrt(variance)
                 p = float(2 * scipy.special.ndtr(-abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, own)
-            shifts.append(ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
+            shifts.append(ParameterShift(name, *known, score, p < limits.significance_level / len(known_before)))
         return ParameterShiftsSinceBaseline(baseline.is_fit_adequate, self.between_runs_p_value, tuple(shifts))
 
     def shifted_parameters_with_prior(self, fit: RefittedModel, limits: Thresholds) -> list[str]:
@@ -325,8 +324,7 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
 
 
 def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
-    if problem.has_process_noise:
-        problem = problem_with_sensor_noise_only(problem)
+    problem = problem_with_sensor_noise_only(problem)
     found = problem.predict_held_out(problem.pack_unknowns({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:

@@ -221,7 +221,7 @@ class BlindCaseGenerator:
             what, allowed = "the arms have prescribed joints, or no driven ones", "driven joints alone"
             raise ConfigError(what, where="model.arms.mode", allowed=allowed, hint="set model.arms.mode: driven")
         self.problem, self.seed, self._finer = problem, seed, finer
-        self._candidates = candidates
+        self.candidates = candidates
         recording = problem.episodes[0].recording
         self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.camera_pose is not None for group in recording.points)
@@ -293,7 +293,7 @@ class BlindCaseGenerator:
     ) -> list[_Detectable]:
         """Return every candidate with its sensitivity at the parameters `truth` of recordings without effects."""
         problem = self._nominal_problem(clean)
-        effects = make_candidate_effects(problem.system, clean, self._candidates)
+        effects = make_candidate_effects(problem.system, clean, self.candidates)
         composed = AllCandidatesProblem.from_problem(problem, effects, [held_out])
         _, signatures = linearize_candidates(composed.with_whitening_linearized_at(truth), (), truth)
         return [(s.effect, s.shape_values, np.linalg.qr(s.projected_sensitivity).R) for s in signatures]
@@ -465,19 +465,17 @@ def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mappin
 
 
 def diagnose_unlabelled_case(
-    ensemble: BlindCaseGenerator, case: UnlabelledCase, candidates: CandidateNamesOrAll, thresholds: Thresholds
+    ensemble: BlindCaseGenerator, case: UnlabelledCase, thresholds: Thresholds
 ) -> DiagnosisResult:
     """Diagnose a blind-test case from its recordings and excluded kinds of effects, without its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
-    return diagnose(problem, candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
+    return diagnose(problem, ensemble.candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
 
 
-def true_effects_gap_closure(
-    ensemble: BlindCaseGenerator, case: UnlabelledCase, label: CaseGroundTruth, candidates: CandidateNamesOrAll = "all"
-) -> float:
+def true_effects_gap_closure(ensemble: BlindCaseGenerator, case: UnlabelledCase, label: CaseGroundTruth) -> float:
     """Return the fraction of the held-out gap that the true effects close after a refit. NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)
-    effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
+    effects = make_candidate_effects(problem.system, case.estimation_recordings, ensemble.candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])
     nominal = fit_nominal_model(problem, composed)
     true = {entry.label: entry.values for entry in label.injected}

@@ -397,8 +397,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
             left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
             screened = search.screen(final.effects, final.values, "what the effects leave")
-        flagged = [(w.start_time, w.end_time) for w in evidence.nominal_test.windows if w.is_flagged]
-        closed, windows = judged.accepted_effects_closure_by_location, smoother.merge_time_intervals(flagged)
+        windows = smoother.merge_time_intervals(evidence.nominal_test.flagged_windows)
+        closed = judged.accepted_effects_closure_by_location
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)
         # a disturbance that a better model explains was no event
         events = find_events(seen.with_events.problem_fitting_all_samples, final, limits)[0]
@@ -418,7 +418,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     ends = search.stage_ends
     finding = DiagnosisResult(
         **(vars(evidence) | vars(judged)),
-        noise_floor=null_test.assumed_channel_noise_levels(nominal.problem),
+        noise_floor=null_test.assumed_noise_rmse_by_channel(nominal.problem),
         record=search.record,
         smoother_result=smoothed,
         gap_locations=where,

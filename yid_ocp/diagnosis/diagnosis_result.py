@@ -34,7 +34,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     of nd unknown forces [N m or N], offsets and biases [m] in J time intervals.
     """
 
-    noise_floor: tuple[null_test.AssumedChannelNoiseLevel, ...]  # error from noise alone, in the channel's unit
+    noise_floor: Mapping[str, float]  # rms error from noise alone by channel, in the channel's unit
     smoother_result: SmoothedUnknownsResult | None  # None if there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
     nominal_model: RefittedModel
@@ -95,7 +95,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
         after = _errors_to_dict(self.final_model) | attributes_to_dict(self.remaining_test, "chi2_per_dof p_value")
         left = [attributes_to_dict(place, _PLACE_KEYS) for place in self.remaining_gap_locations]
         problem = self.nominal_model.problem
-        noise = {} if problem.has_process_noise else {o.channel: o.noise_rmse for o in self.noise_floor}
+        noise = {} if problem.has_process_noise else self.noise_floor
         reason = "; ".join(text for texts in self.undetermined_sizes(self.thresholds).values() for text in texts)
         held_out = [episode.name for episode in problem.held_out]
         optional = {"law": self.law, "baseline": self.baseline_comparison, "counterfactual": self.counterfactual}
@@ -130,10 +130,10 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
 
 
 def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
-    """Return the statistics that are compared with `Thresholds`, as a JSON-compatible dictionary. None: not known."""
+    """Return the statistics that are compared with `Thresholds`. None: not known."""
     tests, alone = (result.nominal_test, result.nominal_held_out_test), result.single_effect_models
     smoothed = None if result.nominal_model.problem.has_process_noise else result.smoother_result
-    found = {
+    return {
         "p_value": null_test.bonferroni_corrected_min_p_value([test.p_value for test in tests]),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "candidate": null_test.bonferroni_corrected_min_p_value([s.p_value for s in result.screening.candidate_scores]),
@@ -147,7 +147,6 @@ def diagnosis_decision_statistics(result: DiagnosisResult) -> dict[str, Any]:
             for fit in alone
         },
     }
-    return dict(to_json_types(found))
 
 
 def judgement_to_dict(judged: Judgement, seen: NominalModelGapEvidence, where: Sequence[GapLocation]) -> dict[str, Any]:
@@ -181,8 +180,7 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
     closures = {fit.effects[0].label: null_test.held_out_gap_closure(before, fit.held_out_loss) for fit in alone}
     scores = {score.effect.label: score for score in seen.screening.candidate_scores}
     tried = sorted(scores.values(), key=lambda score: score.p_value)
-    pairs = (pair for e in judged.selected_effects for pair in zip(e.equivalent_effects, e.shares, strict=True))
-    shares = {effect.label: share for effect, share in pairs}
+    shares = {label: share for entry in judged.selected_effects for label, share in entry.shares.items()}
     fitted = [*((e.effect, added[-1].refitted_model) for e in added), *((fit.effects[0], fit) for fit in alone)]
     found = [(effect, effect.to_reported_parameters(fit.values, fit.std)) for effect, fit in fitted]
     found += [(s.effect, s.effect.to_reported_parameters(s.predicted_values)) for s in tried]
@@ -196,5 +194,5 @@ def _ranked_candidates(judged: Judgement, seen: NominalModelGapEvidence) -> list
             "probability": judged.probability * shares.get(effect.label, 0.0),
             **closures.get(effect.label, null_test.UNDEFINED_GAP_CLOSURE).to_dict(),
         }
-        listed.setdefault(effect.label, to_json_types(entry))
+        listed.setdefault(effect.label, entry)
     return list(listed.values())

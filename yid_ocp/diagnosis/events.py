@@ -31,7 +31,7 @@ from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.errors import SolverError
-from yid_ocp.files import attributes_to_dict, to_json_types
+from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import null_test
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, excess_over_sample_count, times_since_recording_start
 from yid_ocp.inference.smoother import (
@@ -99,7 +99,7 @@ class ForceOrFaultEvent:
     def to_dict(self) -> dict[str, Any]:
         """Convert the event to an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
-        return dict(to_json_types(attributes_to_dict(self, f"{names} std=impulse_std")))
+        return attributes_to_dict(self, f"{names} std=impulse_std")
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def find_events(
         return NO_EVENTS, None
     series, level = null_test.channels_with_residual_indices(judged), limits.significance_level
     test = null_test.residual_chi2_null_test(series, tested.residual, len(fit.values), level)
-    is_flagged = any(window.is_flagged for window in test.windows)
+    is_flagged = bool(test.flagged_windows)
     evaluation = tested
     if (is_flagged and not has_same_data) or own.has_process_noise:
         evaluation = own.evaluate(x, is_flagged, guesses)
@@ -257,11 +257,11 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
 def _allowed(torques: CompiledInverseDynamics, run: _RecordingRollout, nodes: IntArray) -> tuple[Array, Array]:
     """Return the assumed model error of all coordinates' torques, and the torque that friction can hold, (M, n)."""
     episode, result, theta = run
-    terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
+    size, rate, held = torques.torque_magnitude_rate_and_static_friction(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # the time of a torque is known to one sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    return np.hypot(_INVERSE_DYNAMICS_RTOL * terms.rss_torque, late * terms.torque_rate), terms.static_friction_limit
+    return np.hypot(_INVERSE_DYNAMICS_RTOL * size, late * rate), held
 
 
 def _read_forces(

@@ -24,7 +24,6 @@ from yid_ocp.effects.law import (
     torque_law_from_tables,
     torque_law_quantity_at_midpoints,
 )
-from yid_ocp.files import to_json_types
 from yid_ocp.inference import null_test
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
 from yid_ocp.model.system import System
@@ -83,19 +82,18 @@ class NonparametricLaw:
         rows = [
             {"quantity": t.quantity, "unit": TORQUE_LAW_QUANTITY_UNITS[t.quantity], "at": x, "torque": f, "std": s}
             for t in self.tables
-            for x, f, s in zip(t.knots.tolist(), t.torque.tolist(), t.torque_std.tolist(), strict=True)
+            for x, f, s in zip(t.knots, t.torque, t.torque_std, strict=True)
         ]
         rival = self.runner_up and dict(zip(("location", "depends_on", "closure"), self.runner_up, strict=True))
-        found = {
+        return {
             "location": self.location,
             "depends_on": self.depends_on,
             "table": rows,
             **self.closure.to_dict(),
-            "visited_range": {name: list(ends) for name, ends in self.visited_range.items()},
+            "visited_range": self.visited_range,
             "runner_up": rival,
             "sentence": self.sentence,
         }
-        return {name: to_json_types(value) for name, value in found.items()}
 
 
 @dataclass(frozen=True)

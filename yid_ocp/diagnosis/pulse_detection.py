@@ -36,17 +36,6 @@ from yid_ocp.sensors.signal_filters import zero_phase_effort_filter
 _STANDSTILL_SPEED = 0.1  # speed below which friction can stick [rad/s or m/s]
 
 
-@dataclass(frozen=True)
-class _TorqueTermSizes:
-    """Magnitudes (M, n) of torques in the inverse dynamics, at M nodes of a rollout and for all n coordinates."""
-
-    # root sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
-    # gravity, springs, friction, effects' forces and the applied or required torque [N m or N]
-    rss_torque: Array
-    torque_rate: Array  # time derivative of the required torque [N m/s or N/s]
-    static_friction_limit: Array  # limit of static friction, zero above `_STANDSTILL_SPEED` [N m or N]
-
-
 class CompiledInverseDynamics:
     """The inverse dynamics of a system, M(q) a + c(q, v) + g(q) = tau, compiled once for all recordings."""
 
@@ -57,8 +46,16 @@ class CompiledInverseDynamics:
     def _function(self) -> ca.Function:
         return _function(self._step.system, self._step.time_step)
 
-    def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Return the magnitudes at nodes (M,), also repeated ones. Speeds and accelerations are finite differences."""
+    def torque_magnitude_rate_and_static_friction(
+        self, theta: Array, rollout: Rollout, nodes: IntArray
+    ) -> tuple[Array, Array, Array]:
+        """Return magnitude, rate and static friction (M, n) of torques at nodes (M,), also repeated ones.
+
+        The magnitude is the root sum of squares of inertia (of every joint's acceleration by itself), Coriolis and
+        centrifugal forces, gravity, springs, friction, effects' forces and the applied or required torque [N m or N].
+        The rate is the time derivative of the required torque. The limit of static friction is zero above
+        `_STANDSTILL_SPEED`. Speeds and accelerations are finite differences.
+        """
         system, time_step = self._step.system, self._step.time_step
         nodes, repeated = np.unique(nodes, return_inverse=True)
         n = system.n_coordinates
@@ -74,8 +71,7 @@ class CompiledInverseDynamics:
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
         rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
-        sizes = np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held)
-        return _TorqueTermSizes(*(size[repeated] for size in sizes))
+        return np.sqrt(squares + applied**2)[repeated], np.asarray(rate)[repeated], np.abs(held)[repeated]
 
 
 def _function(system: System, time_step: float) -> ca.Function:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +37,7 @@ class SelectedEffect:
     refitted_model: RefitStatistics  # refit with all effects up to this one
     cumulative_closure: null_test.HeldOutGapClosure  # closure of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # confusable effects, starting with this one
-    shares: tuple[float, ...]  # of the probability that one of them is a cause
+    shares: Mapping[str, float]  # of the probability that one of them is a cause, by label
 
 
 def total_gap_closure(entries: Sequence[SelectedEffect]) -> null_test.HeldOutGapClosure:
@@ -212,8 +212,8 @@ def select_effects(
         name = join_effect_labels(chosen.effects[:i])
         fit = known.get(name) or search.refit(chosen.effects[:i], chosen.values, f"{name} again") or chosen
         closed = null_test.held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss)
-        same = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
-        added.append(SelectedEffect(effect, fit, closed, *same))
+        same, shares = _equivalents_and_shares(effect, rivals.get(effect.label, ()))
+        added.append(SelectedEffect(effect, fit, closed, same, shares))
     alone = [fit for fit in known.values() if len(fit.effects) == 1]
     alone.sort(key=lambda fit: (fit is not chosen, fit.effects[0].label != best, _chi2(fit)))
     return tuple(alone), tuple(added), _model_error_std(chosen, later, limits)
@@ -280,15 +280,15 @@ def _revised(
 
 def _equivalents_and_shares(
     effect: EffectBase, rivals: Sequence[tuple[EffectBase, float]]
-) -> tuple[tuple[EffectBase, ...], tuple[float, ...]]:
-    """An effect and its likely rivals, given with their distances, and their shares of its probability."""
+) -> tuple[tuple[EffectBase, ...], dict[str, float]]:
+    """An effect and its likely rivals, given with their distances, and their shares of its probability by label."""
     known = {own.label: (own, distance) for own, distance in ((effect, 0.0), *rivals)}
     effects, distances = zip(*known.values(), strict=True)
     weights = np.exp(-_LOG_ODDS_PER_DISTANCE * np.array(distances))
     shares = weights / weights.sum()
     order = np.array([0, *1 + np.argsort(-shares[1:], kind="stable")])
     kept = order[np.cumsum(shares[order]) - shares[order] < _SET_PROBABILITY]
-    return tuple(effects[i] for i in kept), tuple(shares[kept].tolist())
+    return tuple(effects[i] for i in kept), {effects[i].label: float(shares[i]) for i in kept}
 
 
 def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:

@@ -23,12 +23,10 @@ _MAX_NAMED = 5  # number of named parameters, the most significant changes first
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
 _IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
 _LONGER_SEARCH = "To try the rest, remove diagnosis.budget, or raise it."
-GAP_ORIGIN_TEXTS = {
+_ORIGIN_TEXTS = {
     "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
     "sensor": "a sensor, not the mechanics",
     "either": "the mechanics or the effort sensor (recorded efforts alone do not show which)",
-    "both": "both the mechanics and a sensor",
-    "none": "neither the mechanics nor a constant error of a sensor, as far as these unknowns can show",
 }
 
 
@@ -44,7 +42,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         wider = f"Record a motion in which {aspects[0]}{at} varies over a wider range."
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
-    still = {*_IMMOVABLE_LOCATIONS, *(own.channel.rpartition(".")[0] for own in result.noise_floor)}  # also sensors
+    still = {*_IMMOVABLE_LOCATIONS, *(channel.rpartition(".")[0] for channel in result.noise_floor)}  # also sensors
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
     movable = ", ".join([name for name in first if name not in still])
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
@@ -175,41 +173,37 @@ def _named_locations(result: DiagnosisResult) -> list[GapLocation]:
     return [place for place in result.gap_locations if place.gap_share >= MIN_GAP_SHARE][:_MAX_NAMED]
 
 
-def gap_locations_sentence(result: DiagnosisResult, *, has_origin: bool = False) -> str:
-    """Return a sentence on the gap's locations, with inseparable ones together, and if `has_origin` on its origin."""
+def _gap_locations_sentences(result: DiagnosisResult) -> str:
+    """Sentences on the gap's locations, with inseparable ones together, and on its origin."""
     where = _named_locations(result)
     if not where:
         return "The recordings do not show in which part of the model or in which sensor the error arises."
     assert result.smoother_result is not None  # it found the locations
-    origin, rest = result.smoother_result.plant_or_sensor_origin, 1 - sum(place.gap_share for place in where)
-    groups = {own.channel.rpartition(".")[0] for own in result.noise_floor}
+    origin = _ORIGIN_TEXTS.get(result.smoother_result.plant_or_sensor_origin, "")
+    rest = 1 - sum(place.gap_share for place in where)
+    groups = {channel.rpartition(".")[0] for channel in result.noise_floor}
     words = {group: f"the readings of {group}" for group in groups}
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
     named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
     rivals = {name for p in where if p.indistinguishable_from for name in (p.location, *p.indistinguishable_from)}
     is_unsure = bool(rivals & {*groups, "camera", "clock"})  # whether a place or a sensor
-    is_told = has_origin and not is_unsure and origin in ("plant", "sensor", "either")
-    side = _said((is_told, f" Its origin is {GAP_ORIGIN_TEXTS[origin]}."))
+    side = _said((origin and not is_unsure, f" Its origin is {origin}."))
     return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 
 
 def _why_gap(result: DiagnosisResult) -> list[str]:
     """Sentences on where a gap lies, on the selected effects, and on the error that is left."""
-    added, where = result.selected_effects, gap_locations_sentence(result, has_origin=True)
+    added, where = result.selected_effects, _gap_locations_sentences(result)
     if not added:
         return [where, *_remains(result)]
     names, total = listed([entry.effect.label for entry in added]), added[-1].cumulative_closure
     removed, of = f"Adding {names} removes", "of the error beyond noise on held-out motions"
     low, high = (f"{100 * end:.3g}" for end in (total.ci_low, total.ci_high))
     interval = f" (95 % interval {low} to {high} %)" * (low != high)
-    unknown = f"{removed} an unknown part {of}"
-    is_within = result.nominal_model.held_out_loss.excess_chi2_per_sample <= 0
-    closed = _said(
-        (math.isfinite(total.ci_low), f"{removed} {100 * total.fraction:.3g} % {of}{interval}."),
-        (is_within, f"{unknown}, because the nominal model's error there is within noise."),
-        (True, f"{unknown}."),
-    )[0]
+    unknown = f"{removed} an unknown part {of}, because the nominal model's error there is within noise."
+    known = f"{removed} {100 * total.fraction:.3g} % {of}{interval}."
+    closed = _said((math.isfinite(total.ci_low), known), (True, unknown))[0]
     sizes = [_named(entry.effect, added[-1].refitted_model, result.thresholds) for entry in added]
     return [where, closed, *sizes, *_remains(result)]
 
@@ -242,8 +236,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     fitted, problem = result.nominal_model.values, result.nominal_model.problem
     divided = problem.options.divided_links_model
     more_links = listed(divided.settings) if divided else ""
-    predicted, known = result.nominal_model.held_out_loss.channel_rmse, [own.channel for own in result.noise_floor]
-    tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in (predicted, known))
+    channels = result.nominal_model.held_out_loss.channel_rmse, result.noise_floor
+    tested, measured = (dict.fromkeys(name.rpartition(".")[0] for name in of) for of in channels)
     lost = listed([group for group in measured if group not in tested])
     other_channels = f"The held-out motions have no {lost}, so only {listed([*tested])} tests the model there."
     free = [(name, problem.system.parameters[name]) for name in problem.shared_parameters if fitted[name] != 0]
@@ -297,8 +291,7 @@ def _bound_by_priors(result: DiagnosisResult) -> list[str]:
     pairs, remedy = [], "To determine an effect, measure these parameters and fix them (parameters.NAME.free: false)."
     for fit in result.single_effect_models:
         assert isinstance(fit, RefittedModel)
-        if fit.evaluation.jacobian is None:
-            continue
+        assert fit.evaluation.jacobian is not None
         at, own = fit.problem.residual_rows, fit.effects[-1]
         data, priors = (fit.evaluation.jacobian[part] for part in (at.data, at.stated_priors))
         names, shared = fit.problem.unknown_names, len(fit.problem.shared_parameters)  # which come first
@@ -322,7 +315,7 @@ def _named(effect: EffectBase, fit: RefitStatistics, limits: Thresholds) -> str:
 
 def _remains(result: DiagnosisResult) -> list[str]:
     """Sentences on the error that remains on held-out motions, and on what the effects change in the model."""
-    noise = {own.channel: own.noise_rmse for own in result.noise_floor}
+    noise = result.noise_floor
     errors = result.final_model.held_out_loss.channel_rmse.items()
     beyond = sorted((max(rms**2 - noise.get(name, 0.0) ** 2, 0.0), name, unit) for name, (rms, unit) in errors)
     shown = {"m": (1e3, "mm")}

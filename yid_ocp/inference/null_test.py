@@ -7,6 +7,7 @@ with n/(1 + 2 sum rho_l^2) degrees of freedom has the same variance. Each determ
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -48,52 +49,29 @@ class OutputResidualIndices:
 
 
 @dataclass(frozen=True)
-class AssumedChannelNoiseLevel:
-    """The noise standard deviation that a problem assumes for one channel (the median over its samples)."""
-
-    channel: str
-    unit: str
-    noise_std: float
-    outputs_per_channel: int = 1  # coordinates of a point
-
-    @property
-    def noise_rmse(self) -> float:
-        """The root mean square error that noise alone causes. For points it is that of a distance."""
-        return math.sqrt(self.outputs_per_channel) * self.noise_std
-
-
-@dataclass(frozen=True)
-class _ResidualWindow:
-    """Test of one channel in a time window [s]. It is flagged if noise alone does not explain r'r in the window."""
-
-    recording: str
-    channel: str
-    start_time: float
-    end_time: float
-    is_flagged: bool
-
-
-@dataclass(frozen=True)
 class NullTestResult:
-    """The result of a null test: chi2 per degree of freedom, p-value and tests of time windows."""
+    """The result of a null test: chi2 per degree of freedom, p-value and flagged time windows."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
     p_value: float
-    windows: tuple[_ResidualWindow, ...]
+    # start and end since the recording's start, of windows of a channel whose r'r noise alone does not explain [s]
+    flagged_windows: tuple[tuple[float, float], ...] = ()
 
 
-def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Return the noise level that the problem assumes for each channel. It is a stated value, not an estimate."""
-    found, told = dict[str, list[Array]](), dict[str, tuple[str, int]]()
+def assumed_noise_rmse_by_channel(problem: EstimationProblem) -> dict[str, float]:
+    """Return the root mean square error that the stated noise alone causes in each channel, in the channel's unit.
+
+    It follows from the median std of the channel's samples. For points it is that of a distance.
+    """
+    found, outputs = dict[str, list[Array]](), dict[str, int]()
     for episode in (*problem.episodes, *problem.held_out):
         for samples in episode.measurements:
             for column, channel in enumerate(samples.channel_name_per_output):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
-                told[channel] = samples.sensor.unit, samples.sensor.outputs_per_channel
+                outputs[channel] = samples.sensor.outputs_per_channel
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
-    medians = {channel: float(np.median(values)) for channel, values in joined.items() if len(values)}
-    return tuple(AssumedChannelNoiseLevel(c, told[c][0], median, told[c][1]) for c, median in medians.items())
+    return {name: math.sqrt(outputs[name]) * float(np.median(std)) for name, std in joined.items() if len(std)}
 
 
 def _variance_inflation(autocorrelation: Array) -> float:
@@ -123,7 +101,7 @@ def residual_chi2_null_test(
     effective = max(degrees - parameters, 1.0)
     ratio = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series)) / max(count - parameters, 1)
     p_value = chi2_p_value(ratio * effective, effective)
-    return NullTestResult(ratio, effective, p_value, _windows(series, residual, level, window))
+    return NullTestResult(ratio, effective, p_value, _flagged_windows(series, residual, level, window))
 
 
 def excess_over_sample_count(residual: Array) -> float:
@@ -336,12 +314,11 @@ def chi2_per_sample_decrease_and_std_error(before: HeldOutLoss, after: HeldOutLo
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def _windows(
+def _flagged_windows(
     series: Sequence[OutputResidualIndices], residual: Array, level: float, length: float
-) -> tuple[_ResidualWindow, ...]:
-    raw, p_values = list[tuple[str, str, float, float]](), list[float]()
-    merged = grouped(((s.recording, s.channel), s) for s in series)
-    for (recording, channel), own in merged.items():
+) -> tuple[tuple[float, float], ...]:
+    spans, p_values = list[tuple[float, float]](), list[float]()
+    for own in grouped(((s.recording, s.channel), s) for s in series).values():
         last = max(float(s.t[-1]) for s in own)
         for k in range(int(last / length) + 1):
             begin, total, degrees, count = k * length, 0.0, 0.0, 0
@@ -351,9 +328,8 @@ def _windows(
                 degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:
                 p_values.append(chi2_p_value(total / count * degrees, degrees))
-                raw.append((recording, channel, begin, min(begin + length, last)))
-    flagged = benjamini_hochberg_mask(p_values, len(raw), level)
-    return tuple(_ResidualWindow(*entry, flag) for entry, flag in zip(raw, flagged, strict=True))
+                spans.append((begin, min(begin + length, last)))
+    return tuple(itertools.compress(spans, benjamini_hochberg_mask(p_values, len(spans), level)))
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:

@@ -268,10 +268,10 @@ def _diagnose_case_from_recordings_task(
     statistics of a diagnosis with thresholds that always accept the best candidate.
     """
     run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
-    case, candidates = _case(name, recordings, without), run.diagnosis.candidates
+    case = _case(name, recordings, without)
     begun, evidence = time.perf_counter(), None
     try:
-        finding = blind.diagnose_unlabelled_case(ensemble, case, candidates, run.diagnosis)
+        finding = blind.diagnose_unlabelled_case(ensemble, case, run.diagnosis)
         result, evidence = finding.to_dict(), blind_scores.diagnosis_evidence_to_dict(finding)
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
@@ -280,7 +280,7 @@ def _diagnose_case_from_recordings_task(
     if experiment["purpose"] == blind.BLIND_ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         wide = blind_scores.thresholds_always_accepting_best_candidate(run.diagnosis)
         try:
-            anything = blind.diagnose_unlabelled_case(ensemble, case, candidates, wide)
+            anything = blind.diagnose_unlabelled_case(ensemble, case, wide)
             found["open"] = to_json_types(diagnosis_decision_statistics(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
@@ -291,10 +291,10 @@ def _true_effect_closure(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], label: Mapping[str, Any]
 ) -> float | None:
     """Task: return the closure of a case by its refitted true effects; None if the fit fails or is not finite."""
-    run, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
+    _, ensemble = _BlindExperiment(**experiment)._build_ensemble(first)
     case, truth = _case(name, recordings, ()), blind.CaseGroundTruth.from_dict(label)
     try:
-        best = blind.true_effects_gap_closure(ensemble, case, truth, run.diagnosis.candidates)
+        best = blind.true_effects_gap_closure(ensemble, case, truth)
     except YidError:
         return None
     return best if math.isfinite(best) else None

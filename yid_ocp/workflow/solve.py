@@ -128,9 +128,9 @@ def solution_to_result_dict(
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, _, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
-    levels = () if problem.has_process_noise else null_test.assumed_channel_noise_levels(problem)
+    levels = {} if problem.has_process_noise else null_test.assumed_noise_rmse_by_channel(problem)
     share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
-    noise = {own.channel: share * own.noise_rmse for own in levels}
+    noise = {channel: share * rmse for channel, rmse in levels.items()}
     meanings = {own.name: own.description for own in problem.system.parameters}
     return {
         "format": "yid-solve/1",

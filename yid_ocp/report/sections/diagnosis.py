@@ -59,7 +59,7 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     changed = bool(finding.accepted_effects)
-    floor, rows = {own.channel: own.noise_rmse for own in finding.noise_floor}, []
+    floor, rows = finding.noise_floor, []
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
         extended = after[channel][0] if changed and channel in after else None
@@ -83,17 +83,15 @@ def _figures_by_model(
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
-    from yid_ocp.diagnosis.sentences import GAP_ORIGIN_TEXTS, MIN_GAP_SHARE, gap_locations_sentence
+    from yid_ocp.diagnosis.sentences import MIN_GAP_SHARE
 
     smoothed = finding.smoother_result
     if smoothed is None:
         return None
     noticed = ", ".join(p.location for p in finding.gap_locations if p.is_observable and p.gap_share < MIN_GAP_SHARE)
     silent = ", ".join(place.location for place in finding.gap_locations if not place.is_observable)
-    evidence, origin = smoothed.log_evidence, GAP_ORIGIN_TEXTS[smoothed.plant_or_sensor_origin]
+    evidence = smoothed.log_evidence
     sentences = [
-        f"Most probably the gap of the {_NOMINAL_LABEL} comes from {origin}.",
-        gap_locations_sentence(finding),
         f"Nothing is wrong at {noticed}: a gap would have been detected there." if noticed else "",
         f"These motions and sensors cannot show whether there is a gap at {silent}." if silent else "",
         "Method: unknown forces and offsets of grasps (mechanics) and biases of measured points (sensors), which may "
@@ -153,12 +151,10 @@ def _time_map(finding: DiagnosisResult, smoothed: SmoothedUnknownsResult, i: int
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:
     events = finding.events
-    if not events:
+    if not events.force_estimates:
         return None
     drawn = "Points show the force or torque that the model lacks. Points of a correct model lie between grey lines. "
     drawn += "Shaded windows are events, with their shape as a line. Where possible, the results below leave them out."
-    told = events.overspeed_sentences(finding.thresholds.max_joint_speed)
-    sentences = [drawn * bool(events.force_estimates), *told]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
         found = [event for event in events.events_of_recording(force.recording) if event.channel == force.coordinate]
@@ -169,7 +165,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
         plot = TimePlotData(title, lines, force.t, force.most_likely_force_signal, None, spans, dots_name="estimated")
         by_recording.setdefault(force.recording, []).append(plot)
-    return "Brief disturbances", sentences, _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
+    return "Brief disturbances", [drawn], _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
 
 
 def _recording_figures(
@@ -230,7 +226,6 @@ def _law(finding: DiagnosisResult) -> _Chapter | None:
     rival, is_simple = law.runner_up, bool({"angle", "speed"} & {*law.visited_range})
     use = f"{{kind: law, location: {law.location}, depends_on: {law.depends_on}, law_csv: law.csv}}"
     sentences = [
-        law.sentence,
         "The band is two standard deviations. Dotted lines bound the recorded range. Beyond it the law is constant.",
         "The dashed line is the nearest spring or friction law." * is_simple,
         f"The next best law, of {rival[1]} at {rival[0]}, would remove {100 * rival[2]:.3g} %." if rival else "",
