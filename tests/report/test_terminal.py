@@ -227,7 +227,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")
     assert ("published" in head, "truth" in head) == (True, False)
-    said = "Use the column `gauss_newton (reference)`: all methods agree within their ± on the parameters that"
+    said = "All methods agree within their ± on the parameters that are found, so you can use any column. The"
     halves = {"gauss_newton": solved(), "late": solved(status="stopped"), "short": solved(status="iteration_limit")}
     ends = line_of(told("yid-compare/1", compared(methods=halves)), "status").split()[1:]
     assert ends == ["converged", "time", "limit", "iteration", "limit"]
@@ -310,9 +310,12 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     which = [entry | {"location": at, "p_value": p} for at, p in (("T1", 0.0), ("T2", 0.0034), ("T3", 0.5))]
     known = {"summary": "There is a gap.", "verdict": "unknown", "next_plan": None, "seconds": {"fit": 1.0}}
     result = known | {"gap": {"before": {"rmse": {}, "unit": {}}}, "which": which}
-    lines = told("yid-diagnosis/2", result)
-    assert [line_of(lines, f"kelvin_voigt@{at}")[-7:].strip() for at in ("T1", "T2")] == ["< 1e-12", "0.0034"]
-    assert not any("kelvin_voigt@T3" in line for line in lines)
+    fitted = {"which": [*({**own, "closure": 0.5} for own in which[:2]), which[2]], "confusable": [which[1:]]}
+    lines = told("yid-diagnosis/2", result | fitted)
+    words = [" ".join(line_of(lines, f"kelvin_voigt@T{i}").split()[-3:]) for i in (1, 2, 3)]
+    assert words == ["% < 1e-12", "% 0.0034 possible", "forecast) 0.5 possible"]
+    assert "tau = 0.05 s  not fitted (values: forecast)" in line_of(lines, "kelvin_voigt@T3")
+    assert not any("kelvin_voigt" in line for line in told("yid-diagnosis/2", result)), "none was fitted"
     unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
     lines = told("yid-diagnosis/2", result | {"unseen": unseen})
     at = next(i for i, line in enumerate(lines) if "would not show" in line)
@@ -322,7 +325,6 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
     beside = told("yid-diagnosis/2", result | {"effects": which[1:], "verdict": "effect"})
     assert "fitted beside others only  0.0034  " in line_of(beside, "kelvin_voigt@T2")
-    assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
     section = {"goal": "information", "effects_to_discriminate": ["density@T3", "point_mass@w_T3"]}

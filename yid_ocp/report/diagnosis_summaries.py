@@ -20,7 +20,6 @@ from yid_ocp.display import (
     unseen_effects_sentence,
 )
 from yid_ocp.effects import EFFECTS
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     MAX_NOISE_RATIO,
@@ -42,7 +41,6 @@ from yid_ocp.report.terminal import (
     value_text_and_display_unit,
 )
 
-_MAX_FORECASTS = 5  # largest number of listed candidates that were not fitted; result.json has all
 _MAX_TERMINAL_PARAMETERS = 6  # largest number of parameters with a column on a terminal; result.json has all
 _FOUND_VERDICTS = ("identifiable", "weak")
 """Verdicts of parameters whose values are shown."""
@@ -79,12 +77,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Pushes and wrong samples", is_page_only=True)
-    fitted, untried = _candidate_rows(result)
+    fitted = _candidate_rows(result)
     yield SummaryTable(fitted, "Effects that were fitted, and the part of the held-out error beyond noise each removes")
     possible = "Possible: not accepted yet, because another cause may explain the error as well."
     yield possible if any("possible" in row for row in fitted) else ""
-    is_page_only = len(fitted) > 1 or verdict == "no gap"
-    yield SummaryTable(untried, "Effects that were not fitted, with forecasts of their size", is_page_only=is_page_only)
     yield unseen_effects_sentence(result.get("unseen", ())) if verdict != "no gap" else ""
     missing = result.get("not_candidates", {}).items()
     lacking = [f"{', '.join(kinds)} ({_SIGNAL_TEXTS.get(signals, signals)})" for signals, kinds in missing]
@@ -117,10 +113,9 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
 
 
-def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
-    """Return table rows of the candidates that were fitted, and of the others with their forecasts."""
-    fitted: TableRows = [("effect", "parameters", "removed error", "p-value of forecast", "verdict")]
-    others: TableRows = [("effect", "forecast parameters", "p-value of forecast", "verdict")]
+def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
+    """Return table rows of the candidates that were fitted or are possible causes."""
+    rows: TableRows = [("effect", "parameters", "removed error", "p-value of forecast", "verdict")]
     chosen = "accepted" if result["verdict"] == "effect" else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
     added = {effect_entry_label(own): chosen for own in result.get("effects", ())}
@@ -138,12 +133,11 @@ def _candidate_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
         ends = (p_value_text(entry["p_value"]), verdicts.get(label, ""))
         if entry["closure"] is not None:
             percent = f"{100 * abs(entry['closure']):.3g} %"
-            fitted.append((label, ", ".join(values), "adds " * (entry["closure"] < 0) + percent, *ends))
-        elif label in added:
-            fitted.append((label, ", ".join(values), "fitted beside others only", *ends))
-        elif label in verdicts or entry["p_value"] < DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level:
-            others.append((label, ", ".join(values), *ends))
-    return fitted, others[: 1 + _MAX_FORECASTS]
+            rows.append((label, ", ".join(values), "adds " * (entry["closure"] < 0) + percent, *ends))
+        elif label in verdicts:
+            how = "fitted beside others only" if label in added else "not fitted (values: forecast)"
+            rows.append((label, ", ".join(values), how, *ends))
+    return rows
 
 
 @SUMMARIES.register("yid-blind/1")
