@@ -34,7 +34,7 @@ WORDS = {
     "spokes": "a whole number from 3",
     "wear": "a list, each a number from 0 below 1, 1 at least",
     "tyre": "slick, grooved",
-    "load": "a number from 0 [N] or a section that has for each name a number",
+    "load": "a number from 0 [N] or a section, such as {NAME: VALUE}, with a number as VALUE",
 }
 
 

@@ -66,7 +66,7 @@ def edited(file, old, new):
         ("mode: prescribed", "mode: prescribed, joints: [sholder]", ("sholder", "did you mean 'shoulder'?")),
         ("mode: prescribed", "mode: prescribed, locked_joints: {albow: 1}", ("albow", "did you mean 'elbow'?")),
         ("double_pendulum.urdf", "doubel_pendulum.urdf", ("no such URDF file", "double_pendulum.urdf")),
-        ("double_pendulum.urdf", "..", ("no such URDF file", "correct the path")),
+        ("double_pendulum.urdf", "..", ("is a folder, but must be a URDF file", "the path of a file")),
         ("estimate.h5", "estimat.h5", ("no such recording", "recordings.estimate", "did you mean 'estimate.h5'?")),
         ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has the sensor 'points'",)),
         ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("is duplicated", "held_out")),
