@@ -121,8 +121,10 @@ def effect_entry_label(entry: Mapping[str, Any]) -> str:
 
 def unseen_effects_sentence(labels: Sequence[str]) -> str:
     """Sentence on effects that recordings would not show. Empty if there are none."""
-    known = grouped(label.partition("@")[::2] for label in labels).items()
-    kinds = [f"{kind} ({len(own)} places)" if len(own) > 1 else f"{kind}@{own[0]}" for kind, own in known]
+    kinds = list[str]()
+    for kind, (first, *others) in grouped(label.partition("@")[::2] for label in labels).items():
+        more = f" and {count_with_noun(len(others), 'other place')}" if others else ""
+        kinds.append(f"{kind}@{first}{more}")
     return f"These recordings would not show these effects, even if they exist: {', '.join(kinds)}." if kinds else ""
 
 

@@ -253,6 +253,7 @@ BASELINE_DESCRIPTIONS = {
 }
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
 _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
+_MAX_OFFSET_IN_STDS = 3.0  # of a constant error or clock that counts as noise
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
@@ -329,7 +330,9 @@ def _expected_errors(
     without = measurements_minus_sensor_error_estimates(episode.measurements, outcome.predicted_outputs)
     for k, (samples, corrected) in enumerate(zip(episode.measurements, without, strict=True)):
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
-        square = square + (samples.value - corrected.value) ** 2  # by constant errors and the clock's offset
+        # by constant errors and the clock's offset, but no larger ones than expected
+        most = _MAX_OFFSET_IN_STDS**2 * np.sum(samples.output_changes_per_bias_and_clock_std**2, axis=2)
+        square = square + np.minimum((samples.value - corrected.value) ** 2, most)
         for own in able:
             square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
         found |= _rms_by_channel(samples.sensor, square)[0]

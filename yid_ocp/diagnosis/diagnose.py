@@ -393,7 +393,8 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     else:
         fitted, remaining, _ = null_tests_of_fit(*final.at_estimates, limits.significance_level)
         rest = ()
-        if null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria):
+        exceeds = null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria)
+        if exceeds and not search.is_skipped_past_deadline("where the remaining error arises"):
             left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
             rest = smoother.gap_locations_by_smoother_evidence(left)
             screened = search.screen(final.effects, final.values, "what the effects leave")

@@ -121,7 +121,7 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
             "summary": self.summary,
             "absorption": self.nominal_parameters_before_and_after,
             "steps": [{"added": e.effect.label, **_errors_to_dict(e.refitted_model)} for e in self.selected_effects],
-            "unseen": [v.effect.label for v in self.screening.detectability if not v.is_detectable],
+            "unseen": self.screening.undetectable_labels,
             "untried": self.untried,
             **{name: part and part.to_dict() for name, part in optional.items()},
             "seconds": self.stage_seconds,

@@ -287,6 +287,11 @@ class ScreeningResult:
         return max((score.predicted_chi2_decrease for score in self.candidate_scores), default=0.0)
 
     @property
+    def undetectable_labels(self) -> list[str]:
+        """The labels of the candidates that the recordings would not show."""
+        return [entry.effect.label for entry in self.detectability if not entry.is_detectable]
+
+    @property
     def labels(self) -> list[str]:
         """The labels of all candidates."""
         return [entry.effect.label for entry in self.detectability]

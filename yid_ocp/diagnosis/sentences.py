@@ -150,7 +150,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     needs = f"A gap needs both chi2 per degree of freedom above {least:.4g} and p below {level:.2g}."
     seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
-    unseen = [own.effect.label for own in result.screening.detectability if not own.is_detectable]
+    unseen = result.screening.undetectable_labels
     lines = _said((p_value < limits.significance_level, f"{small} {needs}")) + _hidden_changes(result)
     return lines + _said((along < limits.gap_significance_level, narrow), (unseen, unseen_effects_sentence(unseen)))
 

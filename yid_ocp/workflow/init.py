@@ -384,7 +384,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
                 said += ". bias_std is the expected constant error of a torque (a guess: 1 % of its limit in the robot "
                 said += "file, else 5 % of the largest recorded one)"
             if proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only:
-                unused = f"not used: the object is estimated without torques. use: true finds friction too; {said}"
+                unused = f"false: the object is estimated without torques; true: friction is found, too; {said}"
         is_mounted = places and "." in group
         if places and not (proposal.has_object or is_mounted or any(place.frame for place in places)):
             unused = "not used, because the frames of its points are unknown. To use it, set "
