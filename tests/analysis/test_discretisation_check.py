@@ -129,7 +129,7 @@ def test_the_error_of_few_links_is_no_gap_alone_or_beside_an_effect(tmp_path, la
     found = yid.diagnose(yid.load_problem(file), ("density", "camera_latency", "point_mass", "length_scale"))
     assert [effect.label for effect in found.accepted_effects] == causes
     assert (found.is_corrected_for_links, found.remaining_test.chi2_per_dof < 1.5) == (True, True)
-    assert "set model.object.named_segments.north.links: 12" in found.summary
+    assert "set model.object.named_segments.north.links: 12" in " ".join(found.next_steps)
     true, fit = {"bend": 1.5 * TRUTH["north.bend"], "delay": late, "mass": 0.03}, found.final_model
     known = [(fit.values[name], fit.std[name], true[name.rpartition(".")[2]]) for name in fit.values]
     assert all(abs(value - own) < 2 * std < 0.04 * own for value, std, own in known)
