@@ -226,12 +226,7 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             scenes.append(animation_of_trajectories(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps(animations_to_dict(scenes[:_MAX_ANIMATIONS], findings.robot), separators=(",", ":"))
-    both = any(
-        motion.name == "measured" and any({*motion.point_indices} & {*own.point_indices} for own in others)
-        for entry in scenes
-        for *others, motion in (entry.motions,)
-    )
-    return {"scenes": text.replace("<", "\\u003c"), "both": both} if scenes else None
+    return {"scenes": text.replace("<", "\\u003c")} if scenes else None
 
 
 @register_report_section("fit", 20, "How well it fits")

@@ -44,7 +44,10 @@ class Viewer {
       const measured = scene.motions.find((motion) => motion.name === "measured");
       return measured && scene.motions.some((motion) => motion !== measured && Object.keys(motion.points).some((name) => name in measured.points));
     });
-    if (both) select("errors", [["errors ×1", 1], ["errors ×5", 5], ["errors ×20", 20]], 1, (value) => { this.factor = Number(value); this.paint(); });
+    if (both) {
+      select("errors", [["errors ×1", 1], ["errors ×5", 5], ["errors ×20", 20]], 1, (value) => { this.factor = Number(value); this.paint(); });
+      bar.parentElement.nextElementSibling.append(" A line joins every measured point with its prediction.");
+    }
     this.marks = {};
     for (const name of new Set(motions.map((motion) => motion.name))) {
       const label = document.createElement("label"), check = document.createElement("input"), mark = document.createElement("i");
