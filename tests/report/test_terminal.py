@@ -49,7 +49,7 @@ def information(**changes) -> dict:
 
 def judged(said: str) -> dict:
     return {
-        "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_unknown": 0.6, "std_alone": 0.3,
+        "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_alone": 0.3,
         "verdict": said, "verdict_unknown": "weak", "interval": None, "std": 1.0,
     }  # fmt: skip
 

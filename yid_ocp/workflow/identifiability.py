@@ -166,17 +166,13 @@ def _identifiability_result(
         return result | {"directions": [], "nuisances": 0, "profiles": {}}
     parameters = {}
     for name, entry in information.parameters.items():
-        unsure = unknown.parameters[name]
-        # less prior knowledge cannot make a parameter better known
-        spread = max(entry.std_relative, unsure.std_relative)
-        parameters[name] = asdict(entry) | {"std_relative_unknown": spread, "verdict_unknown": unsure.verdict}
+        parameters[name] = asdict(entry) | {"verdict_unknown": unknown.parameters[name].verdict}
         parameters[name] |= attributes_to_dict(problem.system.parameters[name.split("[")[0]], "lower upper")
     if ranking is not None:
         result["what_if"] = {
             "base": _outcome(ranking.unchanged_experiment),
             "singles": list(map(_outcome, ranking.single_changes)),
             "smallest": list(map(_outcome, ranking.smallest_sufficient_sets)),
-            "searched": ranking.n_evaluated_sets,
         }
     return result | {
         "parameters": parameters,
