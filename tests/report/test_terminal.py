@@ -28,7 +28,7 @@ def solved(**changes) -> dict:
     return {
         "format": "yid-solve/1", "status": "converged", "message": "done", "iterations": 4, "evaluations": 9,
         "seconds": 1.0, "parameters": {f"p_{said}": parameter(said) for said in verdicts}, "residuals": {},
-        "held_out": [], "fit": GOOD, "whitened_cost": 5.0, "wall_seconds": 1.0, "cpu_seconds": 1.0,
+        "held_out": [], "fit": GOOD, "whitened_cost": 5.0, "wall_seconds": 1.0,
         "disagreements": [],
     } | changes  # fmt: skip
 

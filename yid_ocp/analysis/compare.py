@@ -33,7 +33,6 @@ class _MethodResult:
     whitened_cost: float
     held_out_predictions: list[EpisodeAndPredictionOrFailure]
     wall_seconds: float
-    cpu_seconds: float
 
     @property
     def has_values(self) -> bool:
@@ -91,17 +90,17 @@ def compare_methods(
         own = problem
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
         told = listener(solver.name, max(deadline - time.perf_counter(), 0.0) / (len(solvers) - i))
         solution = fit_problem(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         if whole.has_process_noise:
             solution = replace(solution, parameters=uncertainty.mark_free_estimates_not_trusted(solution.parameters))
-        taken = time.perf_counter() - wall, time.process_time() - cpu
+        taken = time.perf_counter() - wall
         evaluation = problem.evaluate(solution.x, derivatives=own is not problem)
         if own is not problem:  # chi2 of all methods must count the same residual
             fit = uncertainty.assess_goodness_of_fit(problem, evaluation, limits)
             solution = replace(solution, goodness_of_fit=fit)
-        runs.append(_MethodResult(solver.name, solution, evaluation.cost, own.predict_held_out(solution.x), *taken))
+        runs.append(_MethodResult(solver.name, solution, evaluation.cost, own.predict_held_out(solution.x), taken))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
         runs[runs.index(best)] = best = replace(best, solution=solution_with_profile_intervals(problem, best.solution))

@@ -111,7 +111,6 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     for samples in episode.measurements:
         known = samples.std[np.isfinite(samples.std)]
         noise[samples.sensor.group_name] = {
-            "samples": int(np.sum(np.any(samples.weight > 0, axis=1))),
             "std": share * float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
@@ -158,7 +157,6 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     for group, noise_std in ((effort, joints.joint_torque_noise_std), (position, joints.joint_angle_noise_std)):
         choice = problem.options.sensors.get(group, SensorOptions())
         noise[group] = {
-            "samples": len(arm.t),
             "std": float(np.median(noise_std(arm, problem.system.driven, choice, episode.name))),
             "unit": CHANNEL_KINDS[group].unit,
             "estimated": not joints.is_noise_std_stated(arm, group, choice),
@@ -255,7 +253,7 @@ def _fine_time_step(h: float, hertz: float) -> float:
 
 def _row(value: float, found: step_diagnostics.UndampedStepMapFrequencies) -> dict[str, Any]:
     hertz = found.frequencies_hz[:_N_MODES].tolist()
-    return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
+    return {"value": value, "hertz": hertz, "message": found.message}
 
 
 def _warn(found: dict[str, Any], what: str, when: str, remedy: str, rows: list[dict[str, Any]]) -> None:

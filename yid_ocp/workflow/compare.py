@@ -51,7 +51,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         held_out = checks.held_out_predictions
         methods = {}
         for tried in comparison.method_results:
-            known = attributes_to_dict(tried, "whitened_cost wall_seconds cpu_seconds")
+            known = attributes_to_dict(tried, "whitened_cost wall_seconds")
             known["disagreements"] = comparison.disagreements[tried.method]
             methods[tried.method] = solution_to_result_dict(problem, tried.solution, tried.held_out_predictions) | known
         keys = "reference=reference_method agree=is_consistent disturbed=has_process_noise"

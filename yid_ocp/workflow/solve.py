@@ -43,8 +43,7 @@ def run_solve(
         solution = estimation.solve(problem, run.solver, callback=log_iterate, progress=progress)
         problem, checks = solution.problem or problem, solution.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions
-        end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
-        folder.log_event("end", **end)
+        folder.log_event("end", status=solution.status.value, message=solution.message)
         prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         offsets = prediction_outputs.torque_offsets_by_recording
         copied = problem.system, problem.unpack_episode_unknowns(solution.x, 0)[0], solution.parameters
