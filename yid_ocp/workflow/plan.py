@@ -70,7 +70,7 @@ def run_plan(
         trajectory = joint_trajectory_message(found.joint_names, found.t, found.joint_positions, *rates)
         write_text(folder.path / "trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log_event("end", reached=found.is_successful, message=found.message)
-        told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
+        told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(found)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
         planned = ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)
         goal = found.target_position if isinstance(found, TargetMotionPlan) else None
@@ -170,9 +170,9 @@ def _share(values: Array, limit: float) -> float | None:
 
 def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
-    own = attributes_to_dict(found, f"{names} std=end_position_std evaluations=n_evaluations unfinished=is_unfinished")
+    own = attributes_to_dict(found, f"{names} std=end_position_std unfinished=is_unfinished")
     tolerances = "point tolerance=position_tolerance speed_tolerance=point_rest_speed_tolerance"
-    return own | attributes_to_dict(run.plan, tolerances) | {"time_step": found.simulator.step.time_step}
+    return own | attributes_to_dict(run.plan, tolerances)
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
@@ -222,19 +222,16 @@ def _parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, f
     return {name: entry["before"] for name, entry in result["absorption"].items()}, sizes
 
 
-def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
+def _information_plan_result(found: InformativeMotionPlan) -> dict[str, Any]:
     stds = "std_relative_before=std_recorded std_relative_after=std_planned std_relative_together=std_combined verdict"
     rest = "unseen=unobservable_parameters open=unidentifiable_directions"
-    starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
-        **attributes_to_dict(run.plan, "inform=parameters_to_identify separate=effects_to_discriminate"),
         "parameters": {name: attributes_to_dict(own, stds) for name, own in found.parameter_precisions.items()},
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
             for (first, second), (before, after) in found.effect_distances.items()
         ],
-        "starts": [attributes_to_dict(start, f"{starts} rounds=n_iterations") for start in found.start_results],
-        **attributes_to_dict(found, f"best=best_start_index limits_reached=active_limits {rest}"),
+        **attributes_to_dict(found, f"limits_reached=active_limits {rest}"),
     }
 
 
