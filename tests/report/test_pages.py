@@ -112,7 +112,10 @@ def test_a_whole_report_is_one_self_contained_page(solved_pendulum, tmp_path):
     page = written(findings(solved_pendulum), tmp_path)
     body = page[page.index("<body>") :]
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page)
-    data = (replace(findings(solved_pendulum), noise_fraction=part) for part in (1.0, 0.5))
+    problem, *others = solved_pendulum
+    parts = (replace(problem.options.excess_residual_criteria, noise_fraction_of_stated_std=own) for own in (1.0, 0.5))
+    options = (replace(problem.options, excess_residual_criteria=part) for part in parts)
+    data = (findings((problem.with_options(own), *others)) for own in options)
     bands = [REPORT_SECTIONS["fit"].prepare_context(own)["figures"][0][1]["layout"]["shapes"][0]["y1"] for own in data]
     assert bands[1] == 0.5 * bands[0]
     packed = re.search(r'id="packed">([^<]+)</script>', page).group(1)

@@ -63,7 +63,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             "truth": truth,
             "judged": solution_to_result_dict(own, judged, held_out),
         }
-        known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
+        known = {"problem": own, "solution": judged, "section_data": {"comparison": comparison}}
         written = folder.write_result_and_report(run, progress, result, **known)
     done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
     return CommandOutcome(folder.path, written, None, done)

@@ -81,7 +81,7 @@ class RunFolder:
         written = self.write_result(result, name)
         if run.output.write_report:
             shown.begin_stage("writing the report", 1.5)
-            known = {"robot": run.model.robot, "noise_fraction": run.diagnosis.noise_fraction_of_stated_std} | known
+            known = {"robot": run.model.robot} | known
             write_report(self.path / "report.html", ReportData(run.name, run.description, written, **known))
         return written
 

@@ -64,8 +64,7 @@ def run_solve(
             "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solution_to_result_dict(problem, solution, held_out) | more
-        known = {"problem": problem, "solution": solution, "held_out": held_out}
-        written = folder.write_result_and_report(run, progress, result, **known)
+        written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
     return CommandOutcome(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 

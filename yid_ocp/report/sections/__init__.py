@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from yid_ocp.display import grouped
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
 from yid_ocp.registry import Registry
 from yid_ocp.report.animation import AnimationData
 from yid_ocp.solvers import Solution
@@ -26,9 +25,8 @@ if TYPE_CHECKING:
 class ReportData:
     """The input data of a report: `result` (content of result.json) and, if available, problem, solution and more.
 
-    `animations` replaces the animations made from `problem`, `solution` and `held_out`. `section_data` holds other data
-    for the sections of a command. `robot` is the URDF file from which the arms' meshes are drawn. The actual noise is
-    `noise_fraction` times the stated standard deviations of `problem`.
+    `animations` replaces the animations made from `problem` and `solution`. `section_data` holds other data for the
+    sections of a command. `robot` is the URDF file from which the arms' meshes are drawn.
     """
 
     name: str
@@ -36,10 +34,8 @@ class ReportData:
     result: Mapping[str, Any]
     problem: EstimationProblem | None = None
     solution: Solution | None = None
-    held_out: Sequence[EpisodeAndPredictionOrFailure] = ()
     animations: Sequence[AnimationData] = ()
     robot: str | None = None
-    noise_fraction: float = 1.0
     section_data: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodsComparisonResult
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, Recording
-from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, VERDICT_TABLE_TEXTS
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, VERDICT_TABLE_TEXTS, EstimateChecksBeyondFit
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -204,14 +204,15 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     problem, solution = findings.problem, findings.solution
     if problem is None or solution is None:
         return
-    expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
+    checks = solution.checks or EstimateChecksBeyondFit()
     fitted = zip(problem.episodes, solution.episode_predictions, strict=False)
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
-    for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
+    for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in checks.held_out_predictions]:
         if not isinstance(prediction, str):
             shared, _ = problem.unpack_episode_unknowns(solution.x, i)
             theta = problem.predictor.theta_with_episode_values(episode, shared)
-            yield _PredictedEpisode(role, problem, theta, episode, prediction, expected.get(episode.name, {}))
+            expected = checks.expected_prediction_errors.get(episode.name, {})
+            yield _PredictedEpisode(role, problem, theta, episode, prediction, expected)
 
 
 @register_report_section("scene", 3, "In motion")
@@ -231,9 +232,10 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
-    found, share = [], findings.noise_fraction
+    found = []
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
+        share = own.problem.options.excess_residual_criteria.noise_fraction_of_stated_std
         found += [(f"{name} in {own.episode.name} ({own.role})", curves) for name, curves in _fitted_curves(own, share)]
         for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
             if own.role == _ESTIMATED:
