@@ -113,7 +113,6 @@ def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
         assert [drifted(share).count(entry.name) for share in shares] == [0, 1]
     strange = assess_drift_and_outlier_runs([*runs, run("z", [1.0], [[1.0]], ("c",))]).run_outlier_tests[-1]
     assert (strange.chi2, strange.degrees_of_freedom, strange.p_value) == (0.0, 0, 1.0)
-    assert strange.most_deviating_parameter == ""
 
 
 def test_the_run_that_stands_apart_is_the_one_to_distrust():
@@ -121,7 +120,6 @@ def test_the_run_that_stands_apart_is_the_one_to_distrust():
     runs[2] = run("day2", runs[2].values + np.array([0.2, 0.0]))
     found = assess_drift_and_outlier_runs(runs)
     assert (outliers(found), drifted(found)) == (["day2"], ["a"])
-    assert next(entry.most_deviating_parameter for entry in found.run_outlier_tests if entry.run_name == "day2") == "a"
 
 
 def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():

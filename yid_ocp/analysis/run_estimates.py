@@ -74,7 +74,6 @@ class _RunOutlierTest:
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    most_deviating_parameter: str  # parameter with the largest difference in standard deviations
     is_fit_adequate: bool
     is_outlier: bool  # the other runs agree with each other, but not with this run
 
@@ -157,23 +156,23 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterD
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierTest:
     """Test run `i` against the mean of all other runs. It is an outlier if the others agree without it."""
-    chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
+    chi2, degrees = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
     without = [pool_estimates_and_chi2([*runs[:k], *runs[k + 1 :]])[1:] for k in range(len(runs))]
     rest, free = without[i]
     agree = chi2_p_value(rest, free) >= level or rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i)
     alone = len(runs) > 2 and p < level and agree
-    return _RunOutlierTest(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
+    return _RunOutlierTest(runs[i].run_name, chi2, degrees, p, runs[i].is_fit_adequate, alone)
 
 
-def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:
+def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int]:
     mean, _, _ = pool_estimates_and_chi2(others)
     shared = [name for name in run.parameter_names if name in mean.parameter_names]
     if not shared:
-        return 0.0, 0, ""
+        return 0.0, 0
     own, rest = run._only(shared), mean._only(shared)
     apart, covariance = own.values - rest.values, nearby_positive_definite_covariance(own.covariance + rest.covariance)
     std = np.sqrt(np.diag(covariance))
     unit = apart / std
     chi2 = float(unit @ np.linalg.solve(covariance / np.outer(std, std), unit))
-    return chi2, len(shared), shared[int(np.argmax(np.abs(unit)))]
+    return chi2, len(shared)

@@ -299,8 +299,7 @@ def run_drift_and_outliers_to_dict(found: run_estimates.DriftAndOutlierTestResul
         values = {name: {"value": value, "std": std} for name, value, std in known}
         own = attributes_to_dict(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
         parameters[entry.name] = own | {"values": values}
-    names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=most_deviating_parameter"
-    names += " explains=is_fit_adequate distrusted=is_outlier"
+    names = "name=run_name chi2 degrees=degrees_of_freedom p_value explains=is_fit_adequate distrusted=is_outlier"
     return {
         "format": "yid-history/1",
         **attributes_to_dict(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
