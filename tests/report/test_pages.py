@@ -231,8 +231,6 @@ def test_every_verdict_has_its_chapters(found, verdict, left_out, tmp_path):
 
 def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
     finding = found["effect"]
-    tried = text_of(page_of(replace(finding, verdict="unknown", unknown_reason="none"), tmp_path))
-    assert "the errors with joint_coulomb@elbow, not accepted as cause" in tried
     fit, lost = finding.nominal_model, finding.nominal_model.held_out_loss
     quiet = replace(fit, held_out_loss=replace(lost, block_chi2=0 * lost.block_chi2, baseline_chi2=0.0))
     assert "Refitted: joint_coulomb@elbow" in text_of(page_of(replace(finding, nominal_model=quiet), tmp_path))

@@ -66,10 +66,6 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "noise alone": floor.get(channel)}
         rows.append((channel, shown, {name: (factor * e, None) for name, e in errors.items() if e is not None}))
     sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
-    if not changed:
-        sentences.append("No effect is accepted as cause, so the figure has the nominal model alone.")
-        tried = " and ".join(entry.effect.label for entry in finding.selected_effects)
-        sentences.append(f"The table above also has the errors with {tried}, not accepted as cause." if tried else "")
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
