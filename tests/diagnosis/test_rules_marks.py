@@ -387,9 +387,9 @@ def test_a_proof_is_judged_again_without_a_refit(tmp_path, monkeypatch):
 def written_slice(tmp_path, part, cases, **changes):
     """The folder of a slice whose cases are clean and were called so."""
     labels = [CaseGroundTruth(f"case_{i:03d}", "null", (), None, {}) for i in cases]
-    known = dict.fromkeys(("code", "code_of_cases", "command"), "made up") | {"versions": {}, "candidates": {}}
+    known = dict.fromkeys(("code", "code_of_cases", "command"), "made up") | {"versions": {}}
     answers = [{"seconds": 1.0, "result": said("no_gap")} for _ in cases]
-    found = {"slice": part, "cases": 4, "seed": 1, "purpose": "report", "configs": {}, "variations": {}, **known}
+    found = {"slice": part, "cases": 4, "seed": 1, "purpose": "report", "configs": {}, **known}
     found |= {"labels": [asdict(label) for label in labels], "answers": answers, "best": {}}
     found["labels_sha256"] = labels_json_and_sha256(labels)[1]
     folder = tmp_path / part.replace("/", "-") / str(len(list(tmp_path.iterdir())))

@@ -129,8 +129,6 @@ def run_blind(
         "labels_sha256": commitment["sha256"],
         "command": shlex.join(["yid-ocp", "blind", *map(str, map(proof.config_file, names)), *map(str, flags)]),
         "versions": installed_versions(),
-        "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
-        "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
         "labels": json.loads(sealed),
         "answers": answers,
         "best": best,

@@ -105,7 +105,7 @@ def score_whole_ensemble(
         blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in pairs
     ]
-    own = "seed", "purpose", "code", "code_of_cases", "command", "versions", "candidates", "variations"
+    own = "seed", "purpose", "code", "code_of_cases", "command", "versions"
     result = blind_scores.blind_case_score_summary(marks) | {
         **{key: first[key] for key in (*own, "ensemble_sha256")},
         "slices": [part["slice"] for part in parts],
