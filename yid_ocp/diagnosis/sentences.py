@@ -113,8 +113,7 @@ def _lead(result: DiagnosisResult) -> str:
     probable = " ".join(_said(*shares))
     use = "Use the model for motions like these."
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
-    none = f"{use} There is no relevant gap: {sizes} ({chance}). The recordings {shown}. "
-    none += "Smaller ones may bias the estimates."
+    none = f"{use} There is no relevant gap: {sizes} ({chance}). The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
     equal = "several causes explain the model's error about equally well"
     why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]

@@ -441,8 +441,7 @@ def _with_simulated_noise(run: RunSettings) -> RunSettings:
     for name in run.sensors if first else ():
         if name.startswith("points") and name not in simulated:
             what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
-            hint = "use a recording with the pose of its camera" if simulated else "use a model with model.object"
-            hint += f", or leave this group out (sensors.{name}.use: false)"
+            hint = f"leave it out (sensors.{name}.use: false), or use a model with an object and a known camera pose"
             raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
