@@ -255,7 +255,7 @@ def test_inspect(carried_out, pendulum, tmp_path):
     asked = [part for entry in entries for part in ("--entry", entry)]
     done = carried_out("inspect", pendulum, *asked, "--export", "eq")
     folder, result = done.folder, done.result
-    assert result["format"] == "yid-inspect/1"
+    assert (result["format"], result["patterns"]["A"]["shape"]) == ("yid-inspect/1", [4, 4])
     assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
     assert result["parameters"]["shoulder.stiffness"]["free"]
     assert (folder / "sparsity.png").read_bytes().startswith(b"\x89PNG")

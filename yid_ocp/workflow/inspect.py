@@ -88,6 +88,7 @@ def _run_inspect(
                 for entry in parameters
             },
             "equations": step_diagnostics.step_complexity_summary(step),
+            "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "dependence": {entry.parameter: attributes_to_dict(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
                 "at": point.description,
@@ -199,6 +200,10 @@ def _dependence(
         )
         for entry in found
     )
+
+
+def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:
+    return {"shape": list(pattern.nonzero_mask.shape), "nonzeros": pattern.n_nonzeros, "title": pattern.title}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:
