@@ -156,7 +156,7 @@ def _resident(session: int) -> float:
 def _found(folder: Path) -> dict[str, Any]:
     """What a run found, without what depends on when and where."""
     result = json.loads((folder / "result.json").read_text())
-    for key in ("date", "command", "fit_seconds"):
+    for key in ("date", "command"):
         result.pop(key)
     for frame in result["frames"]:
         frame.pop("seconds")

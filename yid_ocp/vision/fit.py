@@ -251,7 +251,7 @@ class ShapeFitter:
         sight: ProcessedFrameCloud,
     ) -> FrameShapeFit:
         """The fitted shape of a frame, with the standard deviations of its points and the quality of its fit."""
-        q, on_shape = best.q, evidence.is_own | evidence.is_contested
+        q = best.q
         points, jacobian = self._seen(q)
         places = points.reshape(-1, 3)
         spread = np.diag(jacobian @ np.linalg.solve(best.hessian, jacobian.T)).reshape(-1, 3)
@@ -287,7 +287,6 @@ class ShapeFitter:
             point_std=np.sqrt(np.maximum(spread, 0.0) + moved**2 + swath**2 + off_end**2),
             is_point_seen=np.asarray(seen),
             grasp_gaps=np.array(self._gap(q)).reshape(-1, 3),
-            contested_fraction=float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
             dimension_equations=self._size_rows(q, own, evidence),
             link_ends=corners,
         )

@@ -373,7 +373,6 @@ class FrameShapeFit(ShapeFitQuality):
     point_std: Array  # (np, 3), standard deviation of each coordinate [m]
     is_point_seen: BoolArray  # (np,), whether a gripper holds the point or a link beside it has enough own points
     grasp_gaps: Array  # (grasps, 3), vector between the held frame and the gripper of each grasp [m]
-    contested_fraction: float  # fraction of the points on the shape that a touching foreign object makes unusable
     dimension_equations: QuadraticTubeDimensionCost  # cost of lengths and radii in this frame
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 

@@ -27,8 +27,7 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, import_open3d, look_at_pose
-from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceEstimates, TubeDimensionEstimates
-from yid_ocp.vision.shape_evidence import FrameShapeFit
+from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceEstimates
 from yid_ocp.vision.surface_meshes import SceneDescription, VirtualFramesWithTruth
 from yid_ocp.vision.track import SingleFrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
@@ -39,6 +38,10 @@ from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, check_names_in_setting, resolve_recording_path
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
+_FRAME_KEYS = (
+    "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points "
+    "nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds"
+)
 
 
 def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
@@ -122,42 +125,15 @@ def _track_result(
     frames: Sequence[FrameReport], common: SequenceEstimates, things: Sequence[ForeignObject], found: TrackResult | None
 ) -> dict[str, Any]:
     """Return a `yid-track/1` result without issues, inputs and versions. `found` is None if no frame is good."""
-    spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
         "format": "yid-track/1",
         "camera": asdict(common.camera_calibration),
-        "sizes": _sizes_result(common.dimensions),
+        "sizes": asdict(common.dimensions) | {"messages": list(common.dimensions.messages)},
         "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
         "truth_errors": {},
         "dropped": track_result.count_dropped_frames_by_reason(frames),
-        "fit_seconds": float(np.mean(spent)) if spent else 0.0,
-        "frames": [_frame_result(frame, frame.shape_fit) for frame in frames],
-    }
-
-
-def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, Any]:
-    names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
-    names += " nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds"
-    known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
-    return {key: fit and getattr(fit, name) for key, name in known.items()} | files.attributes_to_dict(frame, names)
-
-
-def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
-    fits = sizes.model_values * np.exp(sizes.log_ratio)
-    return {
-        "frames": sizes.n_frames,
-        "messages": list(sizes.messages),
-        "of": {
-            name: {
-                "model": sizes.model_values[i],
-                "fits": fits[i] if sizes.determined_dimension_mask[i] else None,
-                "std": fits[i] * sizes.dimension_log_ratio_std[i] if sizes.determined_dimension_mask[i] else None,
-                "doubted": bool(sizes.contradicted_model_value_mask[i]),
-                "used": sizes.estimated_dimension_mask[i],
-            }
-            for i, name in enumerate(sizes.names)
-        },
+        "frames": [files.attributes_to_dict(frame, _FRAME_KEYS) for frame in frames],
     }
 
 
