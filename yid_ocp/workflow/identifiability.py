@@ -173,6 +173,7 @@ def _identifiability_result(
             "base": _outcome(ranking.unchanged_experiment),
             "singles": list(map(_outcome, ranking.single_changes)),
             "smallest": list(map(_outcome, ranking.smallest_sufficient_sets)),
+            "searched": ranking.n_evaluated_sets,
         }
     return result | {
         "parameters": parameters,
