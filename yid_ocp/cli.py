@@ -298,8 +298,8 @@ class _Parser(argparse.ArgumentParser):
             if not flag.startswith("-"):
                 what, hint = f"'{rest[0]}' is one argument too many", f"leave it out, or {self._help()}"
                 if lacking := [own for own in getattr(found, "overrides", None) or () if "=" not in own]:
-                    value = next(filter(None, (word.strip("=") for word in rest)), "VALUE")
-                    what, hint = f"--set {lacking[0]} has no value", f"write --set {lacking[0]}={value}, without spaces"
+                    name = lacking[0].rstrip(":")
+                    what, hint = f"--set {name} has no value", f"write --set {name}=VALUE, without spaces"
                 raise ConfigError(what, where=self.prog, allowed=self._usage(), hint=hint)
             said = unknown_name_error_arguments(flag, flags, self._help())
             raise ConfigError(f"there is no option '{flag}'", where=self.prog, **said)

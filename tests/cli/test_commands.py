@@ -199,7 +199,7 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
         (["slove"], ("there is no command 'slove'", "did you mean 'solve'?")),
         (["check"], ("the following arguments are required: CONFIG.yaml", "where: yid-ocp check", "--help")),
         (["check", "a.yaml", "b.yaml"], ("'b.yaml' is one argument too many",)),
-        (["check", "--set", "a.b", "=", "0.1"], ("--set a.b has no value", "--set a.b=0.1")),
+        (["check", "--set", "a.b", "=", "0.1"], ("--set a.b has no value", "--set a.b=VALUE")),
         (["solve", "--qiet"], ("there is no option '--qiet'", "where: yid-ocp solve", "did you mean '--quiet'?")),
         (["batch", "a", "--command", "slv"], ("there is no choice of --command 'slv'", "allowed: solve, diagnose")),
     ],

@@ -199,7 +199,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
         ("problem.time_step.deeper=1", ["'problem.time_step' has a value, and no key 'deeper' below it"]),
         ("model.effects={kind: law}", ["a list of sections, such as {kind: KIND, location: ", "entry: [{"]),
         ("problem.time_step=[1", ["not valid YAML"]),
-        ("problem={duration: 0,5}", ["there is no key '5'", "with a decimal point"]),
+        ("problem={duration: 0,5}", ["there is no key '5'", "write a decimal point"]),
         ("parameters=[a]", ["a section, such as {NAME: {initial: VALUE}}"]),
         ("solver={name:single_shooting}", ["put a space after the colon, as in {name: single_shooting}"]),
     ],

@@ -350,12 +350,16 @@ def test_names_with_consecutive_numbers_are_told_by_their_pattern(names, said):
     assert abbreviated_names_text(names) == said
 
 
-@pytest.mark.parametrize("coarse", [False, True])
-def test_the_next_command_of_check_follows_the_advice(coarse):
+def test_the_next_command_of_check_follows_the_advice():
+    """Effects stay out of it, as the option would replace those of the configuration."""
     own = {"recording": "a", "role": "estimate", "groups": {}, "noise": {}, "grasp_gaps": {}}
     issue = dict.fromkeys(("where", "what", "advice"), "x") | {"certainty": "likely", "severity": "warning"}
     issue |= {"cause": "noise_overstated", "setting": "sensors.camera.std: 0.001"}
-    found = {"warnings": ["too coarse"] * coarse, "links": [], "time_step": [], "message": ""}
-    result = {"warnings": [], "convergence": found, "recordings": [own], "issues": [issue], "mechanics": {}}
-    options = "--set sensors.camera.std=0.001" + " --set output.checked_discretisation=both" * coarse
-    assert f"  yid-ocp solve CONFIG {options}" in told("yid-check/1", result)
+    found = {"warnings": ["too coarse"], "links": [], "time_step": [], "message": ""}
+    result = {"warnings": [], "convergence": found, "recordings": [own], "mechanics": {}}
+    options = "--set output.checked_discretisation=both --set sensors.camera.std=0.001"
+    late = issue | {"setting": "model.effects: [{kind: camera_latency}]"}
+    for more, rest in (([], ""), ([late], ", after the advice above is followed")):
+        lines = told("yid-check/1", result | {"issues": [issue, *more]})
+        at = lines.index(f"estimate the free parameters with the advised options{rest}:")
+        assert lines[at + 1] == f"  yid-ocp solve CONFIG {options}"

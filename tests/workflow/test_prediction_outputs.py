@@ -275,6 +275,8 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     only = copied(system, values, **{"elbow.damping": found["elbow.damping"]})
     assert only["mjcf"] == ['<joint name="elbow" damping="0.3"/>']
     lost = {"elbow.damping": (0.3, 9.0, "N m s/rad", "not_identifiable")}
+    found["elbow.damping[run1]"] = found["elbow.damping"]  # of one recording
+    assert copied(system, values, **{"elbow.damping[run1]": found["elbow.damping"]})["yaml"] == []
     [stiff] = copied(system, values, **{"elbow.stiffness": found["elbow.stiffness"]}, **lost)["mjcf"]
     assert ('stiffness="4"' in stiff, "damping" in stiff) == (True, False)
     assert copied(system, values, **{"shoulder.mass": (1.0, 0.1, "kg", "identifiable")})["mjcf"] == []

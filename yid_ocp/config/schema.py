@@ -84,7 +84,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     if name.partition(".")[0] in known and "." in name:
         hint = f"write --set {name}=VALUE, or nested keys in the file, such as parameters: {{NAME: {{free: false}}}}"
     if name.isdigit():
-        hint = "write numbers with a decimal point: a comma separates the keys of a section"
+        hint = "if this is a part of a number, write a decimal point: a comma separates keys"
     if ":" in name:
         hint = "put a space after the colon, as in {" + name.replace(":", ": ") + "}"
     what = f"there is no key '{name}'" + (f" in {within}" if within else "")

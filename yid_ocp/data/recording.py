@@ -556,7 +556,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         index = int(backward[0])
         before, after = float(group.t[index]), float(group.t[index + 1])
         what = f"the clock does not advance from sample {index + 1} to {index + 2}: {before!r} s, then {after!r} s"
-        allowed, hint = "strictly increasing times", f"remove repeated samples ({backward.size} in all)"
+        allowed, hint = "strictly increasing times", f"remove repeated samples ({np.sum(np.diff(group.t) == 0)} in all)"
         if after < before:
             hint = "if the clock was set back, cut the file here into two recordings; if rows are mixed, sort by time"
         raise DataError(what, where=f"{where}/t", allowed=allowed, hint=hint)

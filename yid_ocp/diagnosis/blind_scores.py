@@ -457,7 +457,7 @@ def _refit_to_json(fit: RefitStatistics) -> dict[str, Any]:
 def _screening_to_json(screened: screening.ScreeningResult) -> dict[str, Any]:
     labels, overlaps = screened.labels, screened.overlap_fractions
     near = [(i, j, overlaps[i, j]) for i, j in np.argwhere(overlaps >= _MIN_RECORDED_OVERLAP) if i != j]
-    scores = [{**vars(score), "effect": score.effect.label} for score in screened.candidate_scores]
+    scores = [{**vars(score), "effect": score.effect.label, "changes": {}} for score in screened.candidate_scores]
     seen = {entry.effect.label: entry.is_detectable for entry in screened.detectability}
     return dict(to_lossless_plain_data({"labels": labels, "alike": near, "scores": scores, "detectable": seen}))
 
@@ -483,7 +483,7 @@ class _RecordedCase:
         restored = dataclass_from_plain_data
         before, held = (restored(NullTestResult, test) for test in data["tests"])
         nominal, screened = self._refit(data["nominal_model"]), self._screening(data["screening"])
-        other = (data.get(name, False) for name in ("has_left_baseline", "discretisation_chi2", "has_left_start"))
+        other = (data.get(name, 0) for name in ("has_left_baseline", "discretisation_chi2", "has_left_start"))
         self.evidence = NominalModelGapEvidence(nominal, before, held, screened, *other)
         self.record = EffectSearchRecord(
             {name: fit and self._refit(fit) for name, fit in data["refits"].items()},
@@ -499,7 +499,9 @@ class _RecordedCase:
         overlaps = np.eye(len(data["labels"]))
         for i, j, fraction in data["alike"]:
             overlaps[i, j] = fraction
-        scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in data["scores"])
+        names = {own.name for own in fields(ScoreTestResult)}  # answers of other versions may have more
+        parts = ({name: own[name] for name in names & own.keys()} for own in data["scores"])
+        scores = tuple(ScoreTestResult(**{**own, "effect": self._effects[own["effect"]]}) for own in parts)
         shown = {label: data["detectable"][label] for label in data["labels"]}
         seen = tuple(CandidateDetectability(self._effects[label], {}, own) for label, own in shown.items())
         return replace(EMPTY_SCREENING_RESULT, detectability=seen, candidate_scores=scores, overlap_fractions=overlaps)

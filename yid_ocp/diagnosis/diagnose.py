@@ -180,8 +180,8 @@ def _has_left_start(fit: RefittedModel) -> bool:
     problem, rows = fit.problem, fit.problem.residual_rows.stated_priors
     deviations = fit.evaluation.residual[rows] / problem.options.stated_std_factor
     initial = problem.unknowns.named_values(problem.initial_unknowns)
-    ratios = [fit.values[name] / initial[name] for name in problem.shared_parameters if initial[name] > 0]
-    is_far = any(not 1 / _FAR_RATIO < ratio < _FAR_RATIO for ratio in ratios)
+    known = [name for name in problem.shared_parameters if initial[name] > _FAR_IN_STDS * fit.std[name]]
+    is_far = any(not 1 / _FAR_RATIO < fit.values[name] / initial[name] < _FAR_RATIO for name in known)
     return is_far or float(np.max(np.abs(deviations), initial=0.0)) > _FAR_IN_STDS
 
 
@@ -393,11 +393,11 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     else:
         fitted, remaining, _ = null_tests_of_fit(*final.at_estimates, limits.significance_level)
         rest = ()
-        exceeds = null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria)
-        if exceeds and not search.is_skipped_past_deadline("where the remaining error arises"):
-            left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
-            rest = smoother.gap_locations_by_smoother_evidence(left)
+        if null_test.residuals_exceed_noise((fitted, remaining), limits.null_test_excess_criteria):
             screened = search.screen(final.effects, final.values, "what the effects leave")
+            if not search.is_skipped_past_deadline("the location of the remaining error"):
+                left = smoother.smooth_unknown_forces_and_biases(*final.at_estimates, limits.min_log_bayes_factor)
+                rest = smoother.gap_locations_by_smoother_evidence(left)
         windows = smoother.merge_time_intervals(evidence.nominal_test.flagged_windows)
         closed = judged.accepted_effects_closure_by_location
         where = smoother.gap_locations_from_closures_and_smoother(where, closed, rest, windows)

@@ -332,8 +332,10 @@ def screen_candidates(
     visible, scores, kept = list[CandidateDetectability](), list[ScoreTestResult](), list[_EffectSignature]()
     for grid in grids.values():
         # the smallest amplitude that is detectable at `DETECTABLE_AMPLITUDE_Z` stds
-        found = map(_detectability, grid)
-        visible.append(min(found, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values()))))
+        found = [*map(_detectability, grid)]
+        clearest = min(found, key=lambda o: (not o.is_detectable, min(o.detectable_amplitudes.values())))
+        hidden = {name: max(own.hidden_changes[name] for own in found) for name in clearest.hidden_changes}
+        visible.append(replace(clearest, hidden_changes=hidden))
         chosen = grid[len(grid) // 2]
         if visible[-1].is_detectable:
             tried = [(_score(signature, residual, series), signature) for signature in grid]

@@ -162,10 +162,10 @@ def select_effects(
     """Add effects one by one to close the held-out gap, then try to replace and remove each of them.
 
     Candidates are also tried from the initial values if `moved` (the nominal fit has left the estimates of an earlier
-    run, which are these values), or if it is `far` from them and no candidate leaves only noise. Returns the fits of
-    single effects in the first round, the selected effects, and by effect parameter the std of what further effects may
-    contribute to it. The fit of the chosen effect comes first (its last fit if no other effect is selected), then all
-    other fits by held-out loss.
+    run, which are these values), or if it is `far` from them or from priors and all candidates leave a gap. Returns the
+    fits of single effects in the first round, the selected effects, and by effect parameter the std of what further
+    effects may contribute to it. The fit of the chosen effect comes first (its last fit if no other effect is
+    selected), then all other fits by held-out loss.
     """
     limits, chosen, before, seen = search.thresholds, nominal, nominal, screened
     shortlist, later, rivals = _refit_shortlist(screened, limits), list[RefitStatistics](), _Rivals()

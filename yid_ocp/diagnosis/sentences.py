@@ -155,7 +155,7 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
 
 
 def _hidden_changes(result: DiagnosisResult) -> list[str]:
-    """A line on found parameters that would be wrong by more than 10 % beside an effect that is not detectable."""
+    """A line on found parameters that are wrong by more than 10 % beside an effect of a size that is not detectable."""
     fit, system, told = result.nominal_model, result.nominal_model.problem.system, list[tuple[float, str]]()
     offsets = {f"{frame}.{axis}" for frame in system.mechanism.frames for axis in "xyz"}
     for name in {*fit.problem.shared_parameters} - offsets:
@@ -164,7 +164,7 @@ def _hidden_changes(result: DiagnosisResult) -> list[str]:
         limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(fit.values[name])
         change = f"{name} by up to {_short(most)} {system.parameters[name].unit}".removesuffix(" 1")
         told += _said((fit.std[name] < limit < most, (limit / max(most, 1e-300), f"{change} ({label})")))
-    hidden = "But an effect that these recordings cannot show would change found values by more than 10 %"
+    hidden = "But an effect that is too small for these recordings to show may change found values by more than 10 %"
     return _said((told, f"{hidden}: {listed([text for _, text in sorted(told)], _MAX_NAMED)}."))
 
 

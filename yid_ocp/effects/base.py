@@ -84,7 +84,7 @@ class EffectBase(Effect):
     # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)
     is_local: ClassVar[bool] = False
     is_load: ClassVar[bool] = False  # whether it is carried mass
-    moves_prescribed_joint: ClassVar[bool] = False  # whether a prescribed joint moves otherwise with it
+    moves_prescribed_joint: ClassVar[bool] = False  # whether it changes the motion of a prescribed joint
     is_joint_friction: ClassVar[bool] = False  # whether the command `friction` compares it with other laws
     # whether a location is a sensor `GROUP:FRAME`, which a diagnosis tries if recordings contain it
     is_at_recorded_sensor: ClassVar[bool] = False

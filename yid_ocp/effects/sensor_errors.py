@@ -76,7 +76,7 @@ class _SurfaceOffset(_CameraEffect):
     """The camera sees the near surface: the seen point is a fraction of the tube's radius nearer than the axis."""
 
     equation = "seen point = true + fraction r (c - true)/|c - true|"
-    possible_locations = lambda system: _camera(system) if system.segment_layouts else ()
+    possible_locations = lambda system: ("camera",) if system.segment_layouts else ()
     declared_parameters = (
         ParameterDefinition("fraction", "1", 0.0, 0.0, 1.5, (0.0, 1.0), "shift toward the camera over the radius"),
     )

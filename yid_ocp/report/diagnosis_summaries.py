@@ -414,12 +414,13 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if lost:
         text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
         text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
-    if unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO:
+    is_poor = unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO
+    if is_poor:
         text = "Do not use the constants of friction yet, because no law explains these motions: even with the best "
         text += f"one, '{best}', the error is far larger than noise ({errors}). Run `yid-ocp diagnose`."
     if not chosen["converged"]:
         text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge."
-    elif is_absent:
+    elif is_absent and not is_poor:
         text = f"Use no friction law, because these recordings do not show friction of {joints}."
     yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
     symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
@@ -432,7 +433,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
-    if chosen["converged"] and not result["to_use"] and not is_absent:
+    if chosen["converged"] and not result["to_use"] and not (is_absent or is_poor):
         yield "For a configuration of yid-ocp (the law without values):"
         yield CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{', '.join(result['joints'])}]}}")
     yield from copyable_estimates_blocks(result)
@@ -464,7 +465,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     drifted = [name for name, entry in result["parameters"].items() if entry["drifted"]]
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     poor = [entry["name"] for entry in runs if not entry["explains"]]
-    doubtful = f"; the model does not explain the recordings of {abbreviated_names_text(poor)}, so their ± is large"
+    doubtful = f"; the ± of {abbreviated_names_text(poor)} is large, as the model does not explain the recordings"
     if not drifted and result["p_value"] >= result["level"]:
         yield f"All runs agree within their uncertainty (noise alone: p {p}{doubtful * bool(poor)})."
     elif not drifted:

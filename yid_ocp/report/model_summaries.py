@@ -123,10 +123,8 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     unknown = [name for name in manifest["unknown"] if not {name, name.rpartition(".")[0]}.intersection(lost)]
     gate = manifest["gate"] or {}
     yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
-    text = (
-        f"Do not rely on the value of {abbreviated_names_text(unknown)} in the file: the recordings do not determine "
-    )
-    yield SummaryStatement(f"{text}it, so it is only the last one of the search." if unknown else "", "verdict")
+    text = f"Do not rely on these values in the file, which the run did not find: {abbreviated_names_text(unknown)}."
+    yield SummaryStatement(text if unknown else "", "verdict")
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     alike = grouped(((kind_of_part(name), kinds[own["status"]], own["how"]), name) for name, own in entries)
     rows: TableRows = [("part of the model", "in the file", "how, or why not")]

@@ -29,7 +29,7 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
-    advised_options,
+    advised_step,
     bound_range_text,
     copyable_estimates_blocks,
     discretisation_shift_sentences,
@@ -122,21 +122,18 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Return the commands that help after a fit, by purpose."""
-    issues = result.get("issues") or ()
-    advised = advised_options(issues)
     if result["status"] != "converged":
         asked = re.search(r"Set (solver\.max_iterations): (\d+)", result["message"] * result["fit"]["data_trusted"])
-        more = " ".join([f"solve --set {asked[1]}={asked[2]}", *advised]) if asked else ""
-        return {"estimate with more iterations": more} if asked else {}
-    lost = _names_by_verdict(free)["not_identifiable"]
+        more = "estimate with more iterations"
+        return advised_step(more, f"solve --set {asked[1]}={asked[2]}", result) if asked else {}
+    issues, lost = result.get("issues") or (), _names_by_verdict(free)["not_identifiable"]
     notes, cures = result.get("refinement_notes", {}), discretisation_shift_sentences(result)[1]
     cures += (text for key, own in result.get("finer_settings", {}).items() if key in notes for text in own)
     finer = " ".join(["solve", *map(setting_option, dict.fromkeys(cures))])
     steps = {"estimate again with the finer model": finer} if cures else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
         steps["find what the model lacks, as advised above"] = "diagnose"
-    again = "estimate again" + (" with the advised options" if advised else ", after the advice above is followed")
-    steps |= {again: " ".join(["solve", *advised])} if issues else {}
+    steps |= advised_step("estimate again", "solve", result) if issues else {}
     if result["fit"]["data_trusted"] and not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif result["fit"]["data_trusted"] and len(lost) < len(free):
@@ -526,10 +523,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             rows.append((f"{row['value']:g}", *hertz, *[""] * (count - len(hertz)), row["message"]))
         yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}", is_page_only=True)
     yield convergence["message"]
-    step += ", after the advice above is followed" * is_advised
-    finer = ["--set output.checked_discretisation=both"] if coarse else []
-    solve = " ".join(["solve", *advised_options(result.get("issues", ())), *finer])
-    yield next_steps_table(result, {step: solve} if result["recordings"] and not severe else {})
+    solve = "solve" + " --set output.checked_discretisation=both" * bool(coarse)
+    steps = advised_step(step, solve, result, also=bool(warnings))
+    yield next_steps_table(result, steps if result["recordings"] and not severe else {})
 
 
 def _noise_cells(noise: Mapping[str, Any], share: float) -> Iterator[Sequence[str]]:

@@ -107,7 +107,8 @@ def copyable_estimate_texts(
                 note += f"; joints have {low:.4g} to {high:.4g}, see the export" if high - low > 1e-9 * high else ""
             shown = " ".join(f'{term}="{np.median(size):.4g}"' for term, size in sizes.items() if size)
             lines += [f"<joint {shown}/> <!-- {note} -->"] if shown else []
-    starts = (f"  {name}: {{free: true, initial: {e.value:.6g}}}" for name, e in found.items())
+    shared = {name: e for name, e in found.items() if name in system.parameters}
+    starts = (f"  {name}: {{free: true, initial: {e.value:.6g}}}" for name, e in shared.items())
     labels = {n: n.replace("_", r"\_") for n in found}
     told = {n: f"{e.value:.4g} ± {e.std:.2g}" for n, e in found.items()}
     # nobody quotes the offset of a marker
@@ -119,7 +120,7 @@ def copyable_estimate_texts(
         "uncounted_errors": list(uncounted_errors),
         "left_out": unknown,
         "joints": joints,
-        "yaml": [*model_yaml, "parameters:", *starts],
+        "yaml": [*model_yaml, *["parameters:"] * bool(shared), *starts],
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),
@@ -132,7 +133,8 @@ def _found_joint_terms(
 ) -> dict[str, dict[str, float]]:
     """Return the attributes of each joint in MJCF that depend on parameters `names`, not on `unknown` ones alone."""
     values, found = dict(zip(system.parameters.names, theta, strict=True)), {}
-    moves = ({name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in own} for own in ((), names, unknown))
+    shared = (values.keys() & own for own in ((), names, unknown))  # without those of single recordings
+    moves = ({name: values[name] + 0.01 * (abs(values[name]) or 1.0) for name in own} for own in shared)
     evaluators = (CasadiEvaluator(system, values | moved) for moved in moves)
     terms, others, doubtful = (system_joint_dynamics_terms(system, own) for own in evaluators)
     for joint, own in terms.items():
