@@ -260,6 +260,12 @@ def test_the_rates_of_a_preview_are_those_of_the_import(tmp_path: Path) -> None:
     assert {source.kind for source in contents.sources} == {"numbers"}
 
 
+@pytest.mark.parametrize(("wrong", "units"), [(2, None), (3, {"position": "deg"})])
+def test_few_wrong_angles_are_not_taken_for_degrees(tmp_path: Path, wrong: int, units: dict[str, str] | None) -> None:
+    rows = "".join(f"{0.01 * k},{9.0 if k < wrong else 0.1}\n" for k in range(200))
+    assert preview_file(table(tmp_path, f"t,q_a\n{rows}")).reader_options.get("units") == units
+
+
 def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     rows = "".join(f"{10 * k},{90 + k},500,500,500\n" for k in range(8))
     path = table(tmp_path, "t,q_a,tip_x,tip_y,tip_z\n" + rows + "80,broken,1,1,1\n")

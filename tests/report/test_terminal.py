@@ -363,3 +363,18 @@ def test_the_next_command_of_check_follows_the_advice():
         lines = told("yid-check/1", result | {"issues": [issue, *more]})
         at = lines.index(f"estimate the free parameters with the advised options{rest}:")
         assert lines[at + 1] == f"  yid-ocp solve CONFIG {options}"
+
+
+@pytest.mark.parametrize(("error", "verdict", "words"), [
+    (12.4, "identifiable", "because no law explains these motions"),
+    (12.4, "not_identifiable", "because no law explains these motions"),
+    (1.1, "not_identifiable", "Use no friction law, because these recordings do not show friction"),
+    (1.1, "identifiable", "Use the law 'viscous' for these joints: elbow, as it is the simplest law"),
+])  # fmt: skip
+def test_no_friction_law_is_advised_whose_error_is_far_above_noise(error, verdict, words):
+    law = {"parameters": {"elbow.damping": parameter(verdict)}, "mean_error": error, "standard_error": 0.1}
+    law |= {"beyond_warranted": 0.0, "beyond_warranted_standard_error": 0.0, "converged": True}
+    result = {"unit": "std", "warranted": "viscous", "laws": {"viscous": law}, "joints": ["elbow"], "to_use": {}}
+    lines = told("yid-friction/1", result | {"friction_parameters": ["elbow.damping"], "kinds": ["a", "b"]})
+    assert words in " ".join(lines)
+    assert ("  model:" in lines) == words.startswith("Use the law")

@@ -221,7 +221,7 @@ def guess_non_si_units(recording: Recording) -> tuple[dict[str, str], tuple[str,
     units, notes, joints = dict[str, str](), list[str](), recording.joints
     if joints is not None and joints.position.size:
         counts = np.sum(np.abs(joints.position) > (limit := _MAX_PLAUSIBLE_VALUES["position"]), axis=0)
-        if counts.max() > max(1, _MIN_LARGE_FRACTION * len(joints.t)):
+        if counts.max() > _MIN_LARGE_FRACTION * len(joints.t):
             units["position"], j = "deg", int(counts.argmax())
             many = f"{counts[j]} of {len(joints.t)} samples of {joints.names[j]} would exceed {limit:.2g} rad"
             notes.append(f"{many}, so angles seem to be in degrees")
