@@ -120,7 +120,7 @@ def add_discretisation_errors(
     inflated = discretisation.estimates_widened_by_discretisation_error(solution.parameters, shifts, sizes)
     checked = {kind for own in shifts.values() for kind in kinds if getattr(own, kind) is not None}
     uncounted = uncounted_error_texts(problem, checked)
-    notes = ({} if solution.checks is None else dict(solution.checks.notes)) | notes
+    notes = {**(solution.checks or uncertainty.EstimateChecksBeyondFit()).notes, **notes}
     checks = uncertainty.EstimateChecksBeyondFit(discretisation_shifts=shifts, notes=notes)
     return replace(solution, parameters=inflated), replace(checks, uncounted_errors=uncounted)
 

@@ -156,8 +156,8 @@ def _examined(
     nominal = replace(nominal, held_out_loss=null_test.held_out_loss(own, nominal.unknowns, factor, spread, predicted))
     del predicted  # its derivatives would fill the memory
     least = _LEFT_BY_DISCRETISATION * removed
-    has_left, none_yet = _has_left_start(nominal), EMPTY_SCREENING_RESULT
-    evidence = NominalModelGapEvidence(nominal, test, held_out_test, none_yet, False, least, has_left)
+    evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT)
+    evidence = replace(evidence, discretisation_chi2=least, has_left_start=_has_left_start(nominal))
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
     search.progress.begin_stage(f"screening {count_with_noun(len(effects), 'candidate effect')}", 4.0, ahead)
     found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed

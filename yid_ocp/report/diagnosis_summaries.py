@@ -410,18 +410,18 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     reason = "it is the simplest law, and no other one predicts clearly better"
     if best != next(iter(result["laws"])):
         reason = "no simpler law predicts as well"
-    text = f"Use the law '{best}' for these joints: {joints}, as {reason} ({errors})."
-    if lost:
-        text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
-        text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
     is_poor = unit == "std" and chosen["mean_error"] > MAX_NOISE_RATIO
-    if is_poor:
-        text = "Do not use the constants of friction yet, because no law explains these motions: even with the best "
-        text += f"one, '{best}', the error is far larger than noise ({errors}). Run `yid-ocp diagnose`."
+    text = f"Use the law '{best}' for these joints: {joints}, as {reason} ({errors})."
     if not chosen["converged"]:
         text = f"Use no friction law yet: raise solver.max_iterations, as the fit of '{best}' did not converge."
-    elif is_absent and not is_poor:
+    elif is_poor:
+        text = "Do not use the constants of friction yet, because no law explains these motions: even with the best "
+        text += f"one, '{best}', the error is far larger than noise ({errors}). Run `yid-ocp diagnose`."
+    elif is_absent:
         text = f"Use no friction law, because these recordings do not show friction of {joints}."
+    elif lost:
+        text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
+        text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
     yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
     symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
     constants: TableRows = [("joint", *symbols.values())]

@@ -524,7 +524,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield SummaryTable(rows, f"Lowest natural frequencies [Hz] of the simulation, by {head}", is_page_only=True)
     yield convergence["message"]
     solve = "solve" + " --set output.checked_discretisation=both" * bool(coarse)
-    steps = advised_step(step, solve, result, also=bool(warnings))
+    steps = advised_step(step, solve, result, other_advice=bool(warnings))
     yield next_steps_table(result, steps if result["recordings"] and not severe else {})
 
 

@@ -100,20 +100,20 @@ def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
 
 def advised_options(issues: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """Return the options of the advice on issues by name of the setting. The first issue, the strongest, counts."""
-    parts = [part for own in issues if own["setting"] for part in own["setting"].split("; ")]
-    return {part.partition(": ")[0]: setting_option(part) for part in reversed(parts)}
+    options = dict[str, str]()
+    for part in (part for own in issues if own["setting"] for part in own["setting"].split("; ")):
+        options.setdefault(part.partition(": ")[0], setting_option(part))
+    return options
 
 
-def advised_step(purpose: str, command: str, result: Mapping[str, Any], *, also: bool = False) -> dict[str, str]:
-    """Return a next step with the options that the issues advise. `also`: whether there is other advice.
-
-    Effects are left out, because the option would replace those of the configuration.
-    """
+def advised_step(purpose: str, command: str, result: Mapping[str, Any], other_advice: bool = False) -> dict[str, str]:
+    """Return a next step with the options that the issues of a result advise."""
     issues = result.get("issues") or ()
-    options = [text for name, text in reversed(advised_options(issues).items()) if name != "model.effects"]
-    is_left = also or any(not own["setting"] or "model.effects" in own["setting"] for own in issues)
+    options = advised_options(issues)
+    effects = options.pop("model.effects", None)  # which would replace those of the configuration
+    is_left = other_advice or bool(effects) or not all(own["setting"] for own in issues)
     words = " with the advised options" * bool(options) + ", after the advice above is followed" * is_left
-    return {purpose + words: " ".join([command, *options])}
+    return {purpose + words: " ".join([command, *options.values()])}
 
 
 def setting_option(setting: str) -> str:
@@ -130,7 +130,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     for (cause, _), (first, *others) in kinds.items():
         where = abbreviated_names_text(list(dict.fromkeys(own["where"] for own in (first, *others))))
         rows.append((ISSUE_CAUSE_DESCRIPTIONS[cause], where, first["certainty"]))
-        options = [*reversed(advised_options((first, *others)).values())]
+        options = [*advised_options((first, *others)).values()]
         do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if options else ".")
         example = " at the first place," * any(own["what"] != first["what"] for own in others)
         text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
