@@ -432,8 +432,13 @@ SWING = """<robot name="swing"><link name="base"/><link name="upper"><inertial><
   <joint name="end" type="fixed"><parent link="upper"/><child link="tool"/><origin xyz="0.4 0 0"/></joint></robot>"""
 
 
-@pytest.mark.parametrize("late", [0.0, 0.06])
-def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: float, bench: Path) -> None:
+@pytest.mark.parametrize(
+    ("late", "places", "given"),
+    [(0.0, (1 / 3, 1.0), (33.3, 100)), (0.06, (1 / 3, 1.0), (33.3, 100)), (0.0125, (0.38, 0.96), (40, 95))],
+)
+def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(
+    late: float, places: tuple[float, float], given: tuple[float, float], bench: Path
+) -> None:
     Path("swing.urdf").write_text(SWING)
     t = np.arange(0, 3, 1 / RATE)
 
@@ -441,14 +446,14 @@ def test_late_markers_are_placed_by_where_they_are_while_the_arm_rests(late: flo
         return 0.8 * np.sin(5 * time) * np.clip(time - 0.6, 0, 1)
 
     joints = JointGroup(("lift",), t, angle(t)[:, None])
-    c, s, part = np.cos(angle(t - late))[:, None], np.sin(angle(t - late))[:, None], LENGTH * np.array([1 / 3, 1.0])
+    c, s, part = np.cos(angle(t - late))[:, None], np.sin(angle(t - late))[:, None], LENGTH * np.array(places)
     place = np.stack([0.4 * c + part * s, 0 * c * part, part * c - 0.4 * s], axis=2)
     place += 2e-4 * np.random.default_rng(0).standard_normal(place.shape)
     write_recording(Recording(joints, (PointGroup("points", ("a", "b"), t, place),), name="swing"), "swing.h5")
     assert main(["init", "swing.urdf", "swing.h5", "--out", "swing.yaml", *CABLE]) == 0
     frames = load_config("swing.yaml").model.frames
-    assert frames["b"].parent_frame == "w_cable"
-    assert float(str(frames["a"].parent_frame).partition(":")[2].removesuffix("%")) == pytest.approx(100 / 3, abs=0.1)
+    percents = [str(frames[n].parent_frame).replace("w_cable", ":100").partition(":")[2].rstrip("%") for n in "ab"]
+    assert [float(percent) for percent in percents] == pytest.approx(given, abs=0.1)
 
 
 def test_a_file_of_another_tool_is_imported_along(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

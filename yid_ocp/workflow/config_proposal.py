@@ -53,7 +53,6 @@ _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays be
 _ROUNDED_PLACE_STD = 0.015  # of a point by rounding to that resolution, as a fraction of the length: 5 % / sqrt(12)
 _PLACE_STD = 0.005  # of a point on a segment that was straight once, also off the centreline: it sits on the surface
 _MAX_ROUNDED_PERCENT = 0.2  # largest rounding of a location on a straight segment [%]
-_MAX_BEYOND_LENGTH = 0.02  # of the object's length; no point can be farther from its holder by more
 _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the holder must stand still [s]
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
 _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
@@ -408,16 +407,13 @@ def _places(
 
 
 def _rows_to_place_by(group: PointGroup, poses: Array, branches: Sequence[FlexibleSegment]) -> BoolArray:
-    """Mask (N,) of all samples; of those at standstill if a late clock puts points too far from the holder `poses`."""
-    at, whole = poses[:, :3, 3], np.ones(len(group.t), bool)
-    apart = np.linalg.norm(group.position - at[:, None], axis=2)
-    farthest = float(np.max(apart, initial=0.0, where=np.isfinite(apart)))
-    if len(branches) != 1 or farthest < (1 + _MAX_BEYOND_LENGTH) * branches[0].length or len(group.t) < 2:
-        return whole
-    speed = np.linalg.norm(np.gradient(at, group.t, axis=0), axis=1)
+    """Mask (N,) of samples in which the holder `poses` stand still, so that a late clock has no effect; else of all."""
+    if len(branches) != 1 or len(group.t) < 2:
+        return np.ones(len(group.t), bool)
+    speed = np.linalg.norm(np.gradient(poses[:, :3, 3], group.t, axis=0), axis=1)
     width = 2 * math.ceil(_MAX_LATENESS / float(np.median(np.diff(group.t)))) + 1
     still = maximum_filter1d(speed, width) < _POINT_REST_SPEED
-    return still if still.any() else whole
+    return still if still.any() else ~still
 
 
 def _parts_when_straight(positions: Array, poses: Array, branches: Sequence[FlexibleSegment]) -> Array | None:
