@@ -535,6 +535,8 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
     told = refusal("bag.csv")
     assert re.search("(?s)none of the recorded joints is a joint of the robot: shoulder.*--joints shoulder=NAME", told)
+    (bench / "two.csv").write_text("t,q_l,q_h,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0,0.5\n" for k in range(9)))
+    assert "--joints l=roll,h=pitch" in refusal("two.csv")
     (bench / "bag.csv").write_text((bench / "bag.csv").read_text().replace("q_shoulder", "q_roll"))
     write_recording(moved(SHORT), bench / "one.h5")
     assert "the recording lacks the joint 'pitch', which one has" in refusal("one.h5", "bag.csv")

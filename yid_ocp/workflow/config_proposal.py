@@ -225,7 +225,11 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
     if not (known := [name for name in whole.joint_names if name in recorded]):
         what = f"none of the recorded joints is a joint of the robot: {', '.join(recorded)}"
         hint = "give the URDF or MJCF file of the robot that was recorded. If it is the same robot with other names, "
-        hint += f"rename its joints at the import: --joints {recorded[0]}=NAME_IN_ROBOT,..."
+        matches = {name: [joint for joint in whole.joint_names if joint.endswith(name)] for name in recorded}
+        renamed = f"{recorded[0]}=NAME_IN_ROBOT,..."
+        if all(len(joints) == 1 for joints in matches.values()):
+            renamed = ",".join(f"{name}={joints[0]}" for name, joints in matches.items())
+        hint += f"rename its joints at the import: --joints {renamed}"
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     return known
 
