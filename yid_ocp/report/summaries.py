@@ -385,6 +385,8 @@ def _change_text(name: str, direction: Mapping[str, Any], entry: Mapping[str, An
     relative = direction["std_relative"] * direction["components"][name]
     if entry["value"]:
         return f"{name} {100 * relative:+.3g} %"
+    if entry["std"] is None:
+        return f"{name} {100 * relative:+.3g} % of its typical size"
     return f"{name} {relative * entry['std'] / entry['std_relative']:+.2g} {entry['unit']}"
 
 
