@@ -20,6 +20,8 @@ POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 @pytest.fixture
 def folder(tmp_path):
     write_frame_folder(FrameSequence.from_clouds([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
+    with pytest.raises(DataError, match=r"no points(.|\n)*frame 0"):
+        write_frame_folder(FrameSequence.from_clouds([0.5], [CLOUD[:0]], POSE), tmp_path / "empty")
     return tmp_path / "sequence"
 
 

@@ -245,12 +245,18 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as a folder that `read_frame_folder` reads (PLY clouds). `OutputError` if this fails."""
+    """Write a frame sequence as a folder that `read_frame_folder` reads (PLY clouds).
+
+    Raises `DataError` for a frame without points and `OutputError` if a file cannot be written.
+    """
     path, o3d = files.make_folder(folder), frames.import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
         # float32 keeps 0.2 um at 2 m in half the space
         points = np.ascontiguousarray(sequence.load_cloud(i), dtype=np.float32)
+        if not len(points):
+            hint = "direct the camera at the object (track.virtual_frames.camera_target), or leave the frame out"
+            raise DataError("the frame has no points", where=f"frame {i}", allowed="at least one point", hint=hint)
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
         if not made:

@@ -438,15 +438,16 @@ def _with_simulated_noise(run: RunSettings) -> RunSettings:
     first, system = read_recordings_of_role(run, count=1), build_system(run)
     has_pose = any(group.camera_pose is not None for recording in first for group in recording.points)
     simulated = ("points_arm", "points_camera")[: 1 + has_pose] if system.point_frames else ()
-    for name in run.sensors if first else ():
-        if name.startswith("points") and name not in simulated:
+    missing = [name for name in run.sensors if first and name.startswith("points") and name not in simulated]
+    for name in missing:
+        if run.sensors[name].use is not False:
             what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
             hint = f"leave it out (sensors.{name}.use: false), or use a model with an object and a known camera pose"
             raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, servo", hint=hint)
-    sensors = {name: replace(own, std=None) for name, own in run.sensors.items()}
+    sensors = {name: replace(own, std=None) for name, own in run.sensors.items() if name not in missing}
     return replace(run, sensors=sensors, diagnosis=replace(run.diagnosis, noise_fraction_of_stated_std=1.0))
 
 
