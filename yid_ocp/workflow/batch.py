@@ -164,7 +164,7 @@ def _run_batch_task(
     begun = time.perf_counter()
     if command == "diagnose":
         result = run_diagnose(run, target).result
-        judged, fit = result["model"]["parameters"], result["gap"]["before"]
+        judged, fit = result["model"]["parameters"], result["gap"]["after"]
         status, ok, message = result["verdict"], True, result["summary"]
     else:
         result = run_solve(run, target).result

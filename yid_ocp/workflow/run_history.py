@@ -18,6 +18,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, read_recording
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import attributes_to_dict, file_sha256, is_file, read_input_json
@@ -65,7 +66,11 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         spread = EXTRAPOLATION_FACTOR * np.array(shifts, float)
         matrix += np.outer(spread, spread)
         units = {name: str(parameters[name]["unit"]) for name in names}
-        explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
+        if "fit" in result:
+            explains = bool(result["fit"]["explains"])
+        else:
+            is_rest_noise = bool(result["effects"]) and result["remaining"]["p_value"] >= Thresholds.significance_level
+            explains = is_rest_noise or result["verdict"] == "no_gap"
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
