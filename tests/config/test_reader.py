@@ -77,8 +77,8 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
     assert len(run.parameters) == 6
     assert run.setting_location("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
     assert "line" in run.setting_location("parameters", "T2.bend", "free")
-    made = load_config(None, ["parameters.T9.bend.free=true"])
-    assert made.setting_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
+    made = load_config(None, ["parameters.T9.free=true"])
+    assert made.setting_location("parameters", "T9") == "--set parameters.T9.free: parameters.T9"
     beside = load_config(None, ["diagnosis.budget=60"]).setting_location("diagnosis", "significance_level")
     assert not beside.startswith("--set"), "an override of another key is not to blame"
     whole = load_config(None, ["parameters.T1.bend={initial: 5}"])

@@ -187,7 +187,7 @@ def test_changed_sets_keep_order_and_symbols(three):
         (lambda p: p.with_nominal_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "at most 1 kg"]),
         (lambda p: p.with_nominal_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
         (lambda p: p.lower_and_upper_bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
-        (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["two parameters are called", "T1.bend"]),
+        (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["called 'T1.bend'", "remove the repeated effect"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
         (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "at least 2"]),
     ],

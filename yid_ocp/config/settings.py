@@ -453,7 +453,10 @@ class RunSettings:
         # an override of another key is told only because it made the section of both
         if option == "--set" and not (f"{key}.".startswith(f"{told}.") or told.startswith(f"{key}.")):
             option, place = "", self.config_file
-        rest = f"{key}.".removeprefix(f"{told}.").strip(".0123456789") if option == "--set" else key  # of a list: none
+        rest = key
+        if option == "--set":
+            names = f"{key}.".removeprefix(f"{told}.").split(".")
+            rest = ".".join(name for name in names if not name.isdigit()).strip(".")  # of a list: none
         below = {own for at, own in self.key_locations.items() if at[: len(path)] == path and own.startswith("--set ")}
         said = place if option == "--baseline" else ": ".join(filter(None, (place, rest)))
         return ", ".join((said, *sorted(below - {place})))

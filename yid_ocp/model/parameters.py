@@ -51,7 +51,8 @@ class Parameters(ReprMixin):
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
             twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
-            what, hint = f"two parameters are called '{twice[0]}'", "give each joint, segment and effect its own name"
+            what = f"two parameters are called '{twice[0]}'"
+            hint = "remove the repeated effect, or rename the joint or segment"
             raise ConfigError(what, where="parameters of the model", allowed="every name once", hint=hint)
 
     def _summary(self) -> ReprTexts:

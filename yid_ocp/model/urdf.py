@@ -128,7 +128,7 @@ def read_urdf(
     path : str or Path
         Path or name, as for `urdf_path_from_robot_name`.
     joints : sequence of str, optional
-        Movable joints, in this order except that parents come first; default: all movable joints of the file.
+        Movable joints, in this order except that parents come first; default: all that are not locked.
     locked : mapping of str to float, optional
         Positions of locked joints [rad or m]; default: zero or the nearest limit.
     exclude_links : sequence of str
@@ -146,9 +146,10 @@ def read_urdf(
     robot, where, chosen = _parsed(file), str(file), list(joints or ())
     named = (*chosen, *locked)
     root = _check_tree(robot, where, named)
-    if len(set(chosen)) < len(chosen):
-        twice = max(chosen, key=chosen.count)
-        what, hint = f"joint '{twice}' is listed twice", f"delete one '{twice}'"
+    if len(set(named)) < len(named):
+        twice = max(named, key=named.count)
+        both = " (in joints and in locked joints)" * (twice in locked)
+        what, hint = f"joint '{twice}' is listed twice{both}", f"delete one '{twice}'"
         raise ModelError(what, where=where, allowed="each joint once", hint=hint)
     dropped = _with_all_below(exclude_links, robot, where)
     for joint in robot.joints:
@@ -156,9 +157,9 @@ def read_urdf(
             what = f"joint '{joint.name}' is to be used, but carries the excluded link '{joint.child}'"
             hint = f"leave the link out of exclude_links, or '{joint.name}' out of joints and locked joints"
             raise ModelError(what, where=where, allowed="joints whose links are not excluded", hint=hint)
-    following = _mimicked(robot, joints, locked, where)
+    _lock_mimicking_joints(robot, joints, locked, where)
     if joints is None:
-        joints = [j.name for j in robot.joints if j.type in _MOVABLE_JOINT_TYPES and j.name not in following]
+        joints = [j.name for j in robot.joints if j.type in _MOVABLE_JOINT_TYPES and j.name not in locked]
     placed, bodies, frames = _walk(robot, root, dropped, joints, locked, where)
     order: list[str] = []
     waiting = [name for name in dict.fromkeys(joints) if name in placed]
@@ -335,8 +336,8 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
         log.warning("%s the largest is at most the sum of the others. They are used unchanged. Check <inertia>", what)
 
 
-def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
-    """Names of joints that follow others (`mimic`). They are added to `locked`, because couplings are not modelled."""
+def _lock_mimicking_joints(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> None:
+    """Add the joints that follow others (`mimic`) to `locked`, because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
     following, still = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}, list[str]()
     for name, mimic in following.items():
@@ -354,7 +355,6 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
     if still:
         what = "couplings of joints (mimic) are not modelled, so the first of each pair does not move in the model"
         log.warning("%s: %s: %s", Path(where).name, what, ", ".join(still))
-    return set(following)
 
 
 def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:

@@ -242,14 +242,16 @@ def _check_recordings(
     clamped = () if cable is None else cable.clamped_vertex_names
     for role, recordings in zip(kept, _once(run, estimate, held_out, issues), strict=True):
         for recording in recordings:
-            found = recording_quality_issues(recording, _choice(run), run.problem.duration or np.inf)
-            issues += found
+            span = run.problem.duration or np.inf
+            found = recording_quality_issues(recording, _choice(run), span)
             if any(issue.severity == "refused" for issue in found):
+                issues += found
                 continue
             parts, doubts = split_recording_at_gaps(recording, clamped, anywhere)
-            issues += doubts
+            found += doubts
             for part in parts:
-                issues += _beside_the_model(run, system, arm, cable, part)
+                found += _beside_the_model(run, system, arm, cable, part)
+            issues += [issue for issue in found if not parts or _is_in_used_time(issue, parts, span)]
             role += parts
     if arm is not None:
         issues += _excitation(run, arm, free, kept[0])
@@ -262,6 +264,13 @@ def _check_recordings(
         allowed = f"0.5 s without a gap{where}"
         raise DataError(what, where=run.setting_location("recordings", "estimate"), allowed=allowed, hint=hint)
     return *kept, tuple(issues)
+
+
+def _is_in_used_time(issue: Issue, parts: Sequence[Recording], span: float) -> bool:
+    """Whether an issue concerns the used data: the first `span` seconds of each of the `parts` of a recording."""
+    starts = [float(part.all_groups[0].t[0]) for part in parts]
+    begin, end = issue.begin, issue.end
+    return begin is None or end is None or any(begin <= start + span and start <= end for start in starts)
 
 
 def _without_repeated_warnings(issues: Sequence[Issue]) -> list[Issue]:
