@@ -185,6 +185,8 @@ def compared():
         shift = ParameterShift("T1.bend", "N m/rad", 10.0, 0.1, 12.0, 0.2, 9.0, moved)
         earlier = ParameterShiftsSinceBaseline(is_explained, shared, (shift,))
         yield name, finding("no_gap", baseline_comparison=earlier, **NO_EFFECT)
+    earlier = replace(earlier, parameter_shifts=(replace(shift, z_score=None, has_changed=False),))
+    yield "not testable", finding("no_gap", baseline_comparison=earlier, **NO_EFFECT)
     errors = [{"points.tip": (error, "m")} for error in (0.02, 0.01)]
     better = _PredictionErrors(("bare (without)",), *errors)
     for name, other in {"worse": _PredictionErrors(("a", "b", "c"), *reversed(errors)),

@@ -199,6 +199,7 @@ def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> 
         ((found, "--format", "usd"), ["exported as 'usd'", "sdf, yaml, mcap", "UsdPhysics has no cables yet"]),
         ((found, "--out", tmp_path / "a.mcap"), ["a.mcap would be a folder", f"--out {tmp_path / 'a'}"]),
         ((recording, "--format", "mjcf"), ["the format mjcf needs a run folder", "solve"]),
+        ((recording, "--out", tmp_path / "a.urdf"), ["the format urdf needs a run folder"]),
         ((broken,), ["result.json", "not valid JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),

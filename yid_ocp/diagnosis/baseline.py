@@ -89,12 +89,16 @@ class ParameterShiftsSinceBaseline:
         moved = [own.name for own in self.significant_parameter_shifts]
         changed = f"Changed since the earlier runs by more than the ±: {listed(moved)}. If nothing was "
         changed += "altered on purpose, find the cause before you use the values."
-        p = self.between_runs_p_value
+        untested = [own.name for own in self.parameter_shifts if own.z_score is None]
+        untold = f"These recordings do not show whether these changed since the earlier runs: {listed(untested)}."
+        same = f"No {'other ' * bool(untested)}parameter differs significantly from the baseline (the earlier runs)."
+        is_tested, p = len(untested) < len(self.parameter_shifts), self.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
         return texts_that_hold(
             (moved and not has_rivals, changed),
-            (not moved and not has_rivals, "No parameter differs significantly from the baseline (the earlier runs)."),
+            (untested and not has_rivals, untold),
+            (is_tested and not moved and not has_rivals, same),
             (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
             (not self.is_baseline_explained, small),
         )

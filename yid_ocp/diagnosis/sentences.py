@@ -46,7 +46,7 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
     movable = ", ".join([name for name in first if name not in still])
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
-    larger = "Record faster and larger motions, which show more effects."
+    larger = "Check the stated noise. If it is right, record faster and larger motions, which show more effects."
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {

@@ -326,7 +326,7 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield from (f"For {name}, {note}." for name, entry in result["profiles"].items() for note in entry["notes"])
     yield from details
     only_known = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
-    said = f"Only with start and grasps taken as known can these be found: {', '.join(only_known)}."
+    said = f"With unknown initial states and grasps (if any), these would not be found: {', '.join(only_known)}."
     yield SummaryStatement(said if only_known else "", "verdict")
     flags = " --unknown-grasp" * (result.get("grasp_std") is not None)
     flags += " --unknown-start" * (result.get("start") == "unknown")

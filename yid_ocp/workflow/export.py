@@ -68,10 +68,12 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         blocks = summary_blocks(manifest)
         print_result(arguments, manifest, lambda: summary_terminal_lines(blocks), f"model: {out}", out)
         return EXIT_DONE
+    if form is None and ending and (meant := _FORMAT_BY_ENDING.get(ending, ending)) in _MODEL_FORMATS:
+        form = meant
     if not source.is_dir() and form not in (None, "csv", _MCAP):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
         what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
-        raise ConfigError(what, where=f"--format {form}", allowed=allowed, hint=hint)
+        raise ConfigError(what, where="--format, or the ending of --out", allowed=allowed, hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts = ["The files have the measured and the predicted signals of the run."]
     if source.is_dir():
