@@ -156,7 +156,7 @@ WRONG = {
     "parent_link": ({"parent": "T1", "parent_link_index": 4}, ["parent_link_index is 4", "0 to 3"]),
     "joint_axes": ({"joint_axes": "xxz"}, ["joint_axes is 'xxz'", "x, y, z, each at most once"]),
     "no_axis": ({"joint_axes": ""}, ["joint_axes is ''"]),
-    "two_sections": ({"cross_section_size": (0.1, 0.2)}, ["both radius and cross_section_size", "remove one"]),
+    "two_sections": ({"cross_section_size": (0.1, 0.2)}, ["both radius and cross_section_size", "remove the other"]),
     "no_section": ({"radius": None}, ["neither radius nor cross_section_size", "one of the two"]),
     "flat_section": (
         {"radius": None, "cross_section_size": (0.0, 0.2)},

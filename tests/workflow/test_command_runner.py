@@ -46,7 +46,7 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
             progress.report_parts_done(i, 100, f"frame {i}")
     tracking = ["tracking ...", *(f"  {5 * i} of 100, frame {5 * i}" for i in range(1, 21))]
     said = ["solving ...", *(f"  iteration N, cost 12.5{k}, 1.2 s, first 2 s" for k in ("", *19 * [" (first 12.5)"]))]
-    said[-1] += " (from here on, at most one line every 5 s)"
+    said[-1] += " (then a line every 5 s)"
     lines = re.sub(r"[\d.]+ s, f", "1.2 s, f", capsys.readouterr().err)
     assert re.sub(r"iteration \d+", "iteration N", lines).splitlines() == said + 2 * tracking
 

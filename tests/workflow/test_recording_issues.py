@@ -128,8 +128,7 @@ def test_times_since_1970_give_the_same_problem(damaged):
     late = build_problem(load_config(damaged(joints(t=lambda group: group.t + 1.7e9))))
     assert late.options.data_issues == ()
     issue = Issue("stuck", "", "warning", 1.0, "", "", begin=1.7e9 + 1, end=1.7e9 + 2)
-    part = [late.episodes[0].recording]
-    assert [_is_in_used_time(issue, part, span) for span in (0.5, 1.5)] == [False, True]
+    assert [_is_in_used_time(issue, [late.episodes[0].recording], span) for span in (0.5, 1.5)] == [False, True]
     assert np.allclose(late.episodes[0].prescribed_path, usual.episodes[0].prescribed_path, atol=1e-5)
     assert late.episodes[0].measurements[0].n_residuals == usual.episodes[0].measurements[0].n_residuals
 

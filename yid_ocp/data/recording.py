@@ -351,8 +351,7 @@ def validated_recording(recording: Recording, *, allow_nan_effort: bool = False,
     """
     origin = where or f"recording '{recording.name}'"
     allowed = "numbers of joints, points or another sensor"
-    hint = "import more of the file, or another one. Columns of a table with numbers: --columns COLUMN=position:JOINT "
-    hint += "(or x:POINT, force_x:SENSOR)"
+    hint = "import more data, such as columns of a table: --columns COLUMN=position:JOINT (or x:POINT, force_x:SENSOR)"
     raise_data_error_unless(recording.all_groups, "the recording has no measurements", origin, allowed, hint)
     texts = (("description", recording.description), ("source", recording.source))
     _check_text(origin, *texts, *(("notes", note) for note in recording.notes))

@@ -290,10 +290,8 @@ def _check(segment: FlexibleSegment, known: Mapping[str, SingleSegmentLayout]) -
         what = f"the parent '{parent}' is not a segment that is listed before segment '{segment.name}'"
         refuse(what, **unknown_name_error_arguments(parent, known, f"list '{parent}' first, or leave parent out"))
     if (segment.radius is None) == (section is None):
-        what, hint = "neither radius nor cross_section_size", "set radius: 0.004 or cross_section_size: [0.001, 0.08]"
-        if section is not None:
-            what, hint = "both radius and cross_section_size", "remove one of them, or set it to null"
-        refuse(f"the segment has {what}", "one of the two", hint)
+        found = "both radius and cross_section_size" if section else "neither radius nor cross_section_size"
+        refuse(f"the segment has {found}", "one of the two", "set one, such as radius: 0.004, and remove the other")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
     for quantity, value in (sizes | {f"cross_section_size[{i}]": size for i, size in enumerate(section or ())}).items():

@@ -157,7 +157,7 @@ def read_urdf(
             what = f"joint '{joint.name}' is to be used, but carries the excluded link '{joint.child}'"
             hint = f"leave the link out of exclude_links, or '{joint.name}' out of joints and locked joints"
             raise ModelError(what, where=where, allowed="joints whose links are not excluded", hint=hint)
-    _lock_mimicking_joints(robot, joints, locked, where)
+    _lock_mimics(robot, joints, locked, where)
     if joints is None:
         joints = [j.name for j in robot.joints if j.type in _MOVABLE_JOINT_TYPES and j.name not in locked]
     placed, bodies, frames = _walk(robot, root, dropped, joints, locked, where)
@@ -336,7 +336,7 @@ def _check_bodies(link: str, tensor: Array, where: str) -> None:
         log.warning("%s the largest is at most the sum of the others. They are used unchanged. Check <inertia>", what)
 
 
-def _lock_mimicking_joints(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> None:
+def _lock_mimics(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> None:
     """Add the joints that follow others (`mimic`) to `locked`, because couplings are not modelled."""
     joints = {joint.name: joint for joint in robot.joints}
     following, still = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}, list[str]()

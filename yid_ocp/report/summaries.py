@@ -383,10 +383,8 @@ def _changed_names(direction: Mapping[str, Any]) -> list[str]:
 def _change_text(name: str, direction: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
     """Return a parameter's change along a direction in % of its value, or in its unit if the value is zero."""
     relative = direction["std_relative"] * direction["components"][name]
-    if entry["value"]:
-        return f"{name} {100 * relative:+.3g} %"
-    if entry["std"] is None:
-        return f"{name} {100 * relative:+.3g} % of its typical size"
+    if entry["value"] or entry["std"] is None:
+        return f"{name} {100 * relative:+.3g} %{'' if entry['value'] else ' of its typical size'}"
     return f"{name} {relative * entry['std'] / entry['std_relative']:+.2g} {entry['unit']}"
 
 

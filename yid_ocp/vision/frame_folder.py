@@ -245,10 +245,7 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: frames.FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as a folder that `read_frame_folder` reads (PLY clouds).
-
-    Raises `DataError` for a frame without points and `OutputError` if a file cannot be written.
-    """
+    """Write a frame sequence as a folder of PLY clouds. `DataError` for a frame without points, else `OutputError`."""
     path, o3d = files.make_folder(folder), frames.import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):

@@ -176,9 +176,8 @@ def _run_batch_task(
         std = math.inf if own["std"] is None else own["std"]
         own["verdict"] = own["verdict"] or verdict_by_relative_std(own["value"], std, abs(own["value"]))
     effects = [effect_entry_label(entry) for entry in result.get("effects", ())]
-    found = {"status": status, "ok": ok, "message": message, "chi2_per_dof": fit.get("chi2_per_dof")}
-    found["explains"] = fit.get("explains")
-    found |= {"effects": effects, "parameters": parameters, "seconds": time.perf_counter() - begun}
+    found = {"status": status, "ok": ok, "message": message, "effects": effects, "parameters": parameters}
+    found |= {key: fit.get(key) for key in ("chi2_per_dof", "explains")} | {"seconds": time.perf_counter() - begun}
     return dict(to_json_types(found))
 
 

@@ -200,8 +200,7 @@ class StderrLogLinesProgress(Progress):
         told = self._left.iterate_text(entry)
         if self._left.n_iterates <= _USUAL_ITERATIONS or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
             self._last = time.monotonic()
-            rest = f" (from here on, at most one line every {_MIN_LINE_INTERVAL:g} s)"
-            told += rest * (self._left.n_iterates == _USUAL_ITERATIONS)
+            told += f" (then a line every {_MIN_LINE_INTERVAL:g} s)" * (self._left.n_iterates == _USUAL_ITERATIONS)
             print(f"  {told}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:

@@ -61,18 +61,16 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     if ending in ("csv", _MCAP):
         what, hint = f"{out} would be a folder of {ending} files", f"write --out {Path(out).with_suffix('')}"
         raise ConfigError(what, where="--out", allowed="a folder name without this ending", hint=hint)
+    meant = form or _FORMAT_BY_ENDING.get(ending, ending)
     if source.is_dir() and form != _MCAP:
-        form = form or _FORMAT_BY_ENDING.get(ending, ending)
         with stderr_progress_display(arguments) as progress:
-            manifest = _export_model(source, Path(out), form, arguments.lossy, progress)
+            manifest = _export_model(source, Path(out), meant, arguments.lossy, progress)
         blocks = summary_blocks(manifest)
         print_result(arguments, manifest, lambda: summary_terminal_lines(blocks), f"model: {out}", out)
         return EXIT_DONE
-    if form is None and ending and (meant := _FORMAT_BY_ENDING.get(ending, ending)) in _MODEL_FORMATS:
-        form = meant
-    if not source.is_dir() and form not in (None, "csv", _MCAP):
+    if not source.is_dir() and (form not in (None, "csv", _MCAP) or (ending and meant in _MODEL_FORMATS)):
         allowed = f"csv or {_MCAP} of a recording; {', '.join(_MODEL_FORMATS)} of a run folder of `solve` or `diagnose`"
-        what, hint = f"the format {form} needs a run folder, not {source.name}", "give a run folder, or --format csv"
+        what, hint = f"the format {meant} needs a run folder, not {source.name}", "give a run folder, or --format csv"
         raise ConfigError(what, where="--format, or the ending of --out", allowed=allowed, hint=hint)
     contents: dict[str, Any] = {"notes": []}
     texts = ["The files have the measured and the predicted signals of the run."]

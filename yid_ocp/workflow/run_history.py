@@ -66,11 +66,8 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
         spread = EXTRAPOLATION_FACTOR * np.array(shifts, float)
         matrix += np.outer(spread, spread)
         units = {name: str(parameters[name]["unit"]) for name in names}
-        if "fit" in result:
-            explains = bool(result["fit"]["explains"])
-        else:
-            is_rest_noise = bool(result["effects"]) and result["remaining"]["p_value"] >= Thresholds.significance_level
-            explains = is_rest_noise or result["verdict"] == "no_gap"
+        is_rest_noise = result.get("effects") and result["remaining"]["p_value"] >= Thresholds.significance_level
+        told = result["fit"]["explains"] if "fit" in result else is_rest_noise or result["verdict"] == "no_gap"
         all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
         effects = group_parameter_values_by_effect_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
@@ -84,7 +81,7 @@ def read_estimates(folder: str | Path) -> run_estimates.RunEstimates:
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         what, allowed = "the covariance is missing or invalid", "finite numbers, with a positive diagonal"
         raise DataError(what, where=f"{file}: covariance", allowed=allowed, hint=again)
-    return run_estimates.RunEstimates(str(folder), names, values, matrix, units, explains, effects)
+    return run_estimates.RunEstimates(str(folder), names, values, matrix, units, bool(told), effects)
 
 
 def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:

@@ -431,8 +431,7 @@ def _meanings(
         pattern, meaning = re.sub(r"(?i).+(?=_current$)", "*", unknown[-1]), "position:JOINT"
         if "current" in pattern.lower():
             meaning = f"effort:{'*' if '*' in pattern else 'JOINT'}' --units effort=A --torque-constants '*=N_M_PER_A"
-        hint = f"give each a meaning, such as --columns '{pattern}={meaning}' (or x:POINT, force_x:SENSOR), "
-        hint += f"or leave it out: '{unknown[-1]}=skip'"
+        hint = f"name each, as in --columns '{pattern}={meaning}' (or x:POINT, force_x:SENSOR), or '{unknown[-1]}=skip'"
         raise DataError(what, where=where, allowed=f"{_ALLOWED}, and a unit if it is not SI: q_elbow [deg]", hint=hint)
     return list(meanings.values()), units
 
