@@ -225,8 +225,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     text = "recording to write as CSV or MCAP, or run folder of solve or diagnose whose model or signals to write"
     parser.add_argument("source", metavar="RECORDING.h5|RUN", help=text)
     text = "of a recording: csv (default) or mcap; of a run: mjcf, urdf, sdf, yaml for a configuration that starts at "
-    text += "the estimates (default: by the ending of --out, else mjcf), or mcap for measurements, predictions and "
-    text += "residuals"
+    text += "the estimates (default: by the ending of --out, else mjcf), or mcap for all signals"
     parser.add_argument("--format", metavar="FORMAT", help=text)
     text = "folder for CSV or MCAP files, or file for the model; its manifest is written next to it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)

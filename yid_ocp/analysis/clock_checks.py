@@ -259,8 +259,7 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
         words = f"a fit finds time stamps of {name} {said} and corrects them"
         ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
         if ratio > 1:
-            words += f". Their clock_offset_std is only {1e3 * std:.3g} ms "
-            words += f"({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
+            words += f". Their clock_offset_std is {1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
         else:
             log.warning("recording '%s': %s", own, words)

@@ -130,10 +130,7 @@ def _answers(
     sensors: Sequence[_WhitenedSensor],
     steps: int,
 ) -> Array:
-    """Return each sensor's largest whitened response (sensors, rows) to one unit in each row of the first step.
-
-    `one` is a step from the equilibrium, by which all steps are linearised.
-    """
+    """Largest whitened response (sensors, rows) to a unit in each row of the first step, linearised about `one`."""
     sizes, known = step.sizes, list(step.system.prescribed_coordinate_indices)
     nt = sizes["n"] + sizes["nz"] + sizes["m"]
     unit = np.eye(nt + sizes["n"])

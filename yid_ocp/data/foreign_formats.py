@@ -55,10 +55,7 @@ def column_meanings(
 
 
 def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:
-    """Name and unit of a column such as `time [ms]` or `q1_deg`. The unit is empty if the name has none.
-
-    If the unit is unknown, the name is empty as well.
-    """
+    """Name and unit (empty: none) of a column such as `time [ms]` or `q1_deg`. An unknown unit gives no name."""
     if (bracketed := _BRACKETED_UNIT.fullmatch(column)) and not bracketed[2].isdecimal():
         name, unit = bracketed[1], UNIT_BY_WORD.get(bracketed[2].lower(), "")
         if unit or _exact_meaning(name, sensor_components) or _spelled_meaning(name):

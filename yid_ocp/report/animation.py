@@ -102,10 +102,7 @@ def animations_to_dict(scenes: Sequence[AnimationData], robot: str | None = None
 
 
 def _thinned_robot_meshes(robot: str | None, system: System) -> dict[str, list[list[int]]]:
-    """Return vertices and faces of a robot's thinned meshes by the joint that carries them ("": fixed parts).
-
-    Reading and thinning takes a second, so the user's cache keeps them for the same files and mounting.
-    """
+    """Vertices and faces of thinned robot meshes, cached, by the joint that carries them ("": fixed parts)."""
     with contextlib.suppress(OSError, YidError, SyntaxError):  # the last of a damaged URDF
         if robot is None or "<visual" not in read_input_text(urdf_path_from_robot_name(robot)):
             return {}

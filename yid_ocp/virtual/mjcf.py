@@ -170,10 +170,7 @@ def system_joint_dynamics_terms(system: System, value: CasadiEvaluator) -> dict[
 def _actuation(
     system: System, effects: Sequence[Effect], joint: str, value: CasadiEvaluator
 ) -> tuple[float, float, float, float]:
-    """Gain, offset, delay [s] and lag [s] from a joint's recorded torque (or servo command) to the true one.
-
-    The true value is gain x recorded - offset, delayed and with first-order lag. The last of `effects` acts first.
-    """
+    """Gain, offset, delay [s], lag [s] of a joint's torque or servo command: true = gain x recorded - offset."""
     true = reading = ca.SX.sym("reading")
     channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
     for effect in reversed(effects):

@@ -439,11 +439,10 @@ def _with_simulated_noise(run: RunSettings) -> RunSettings:
     has_pose = any(group.camera_pose is not None for recording in first for group in recording.points)
     simulated = ("points_arm", "points_camera")[: 1 + has_pose] if system.point_frames else ()
     missing = [name for name in run.sensors if first and name.startswith("points") and name not in simulated]
-    for name in missing:
-        if run.sensors[name].use is not False:
-            what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
-            hint = f"leave it out (sensors.{name}.use: false), or use a model with an object and a known camera pose"
-            raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
+    for name in (own for own in missing if run.sensors[own].use is not False):
+        what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
+        hint = f"leave it out (sensors.{name}.use: false), or use a model with an object and a known camera pose"
+        raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"
         raise run.config_error(what, "model", "arms", "mode", allowed="driven, servo", hint=hint)

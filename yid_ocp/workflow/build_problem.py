@@ -244,10 +244,8 @@ def _check_recordings(
         for recording in recordings:
             span = run.problem.duration or np.inf
             found = recording_quality_issues(recording, _choice(run), span)
-            if any(issue.severity == "refused" for issue in found):
-                issues += found
-                continue
-            parts, doubts = split_recording_at_gaps(recording, clamped, anywhere)
+            is_refused = any(issue.severity == "refused" for issue in found)
+            parts, doubts = ([], []) if is_refused else split_recording_at_gaps(recording, clamped, anywhere)
             found += doubts
             for part in parts:
                 found += _beside_the_model(run, system, arm, cable, part)

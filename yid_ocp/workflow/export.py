@@ -146,10 +146,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
 
 
 def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: Progress) -> dict[str, Any]:
-    """Write a run's final model and, except for `yaml`, a manifest of what the format represents. Returns the manifest.
-
-    Raises `ConfigError` if the format cannot represent an estimate, effect or grasp, unless `is_lossy` accepts this.
-    """
+    """Write a run's final model and return its manifest. `ConfigError` for a loss, unless `is_lossy` accepts it."""
     calibrated = _read_calibrated_model(folder)
     if form not in _MODEL_FORMATS:
         why = "; UsdPhysics has no cables yet, nor springs of joints that turn about three axes" * (form == "usd")

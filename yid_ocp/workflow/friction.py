@@ -24,10 +24,7 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
 def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandOutcome[None]:
-    """Fit every friction law with one kind of motion left out in turn, and write the run folder.
-
-    Successful if the warranted law's fit to all recordings converged. Raises `DataError` if no law can be tested.
-    """
+    """Fit all friction laws with each kind of motion left out. Successful if the warranted law's fit converged."""
     said = run.model.friction or FrictionLawSettings(law="viscous")
     with atomic_run_folder(run, out, "friction") as folder:
         folder.record_run_start(run, "friction")
