@@ -136,7 +136,7 @@ def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch
 
 
 def test_a_gap_without_a_cause_is_refitted_with_half_the_time_step(monkeypatch):
-    asked, seen = [], Mock(is_corrected_for_links=False)
+    asked, seen = [], Mock(with_events=Mock(is_corrected_for_links=False))
     seen.evidence.screening.largest_predicted_chi2_decrease, seen.search.thresholds.min_log_bayes_factor = 50.0, 5.0
     monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: None)
     fall = Mock(predicted_chi2_fall_at_finer_step=lambda *given: asked.append(given[-1]) or 26.0)
