@@ -201,9 +201,8 @@ class RefitContext:
 
     def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
-        labels = {score.effect.label for score in screened.candidate_scores} - {without}
         ranked = screened.rank_candidate_pairs
-        return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
+        return self._answer(self.record.pairs, without, lambda: ranked(without)[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
         found = work()
