@@ -80,15 +80,6 @@ class Problem:
         return costing(cost, self.rows)
 
 
-class Memory(dict):
-    """A store."""
-
-    stored_refit = dict.get
-
-    def put(self, name, refitted):
-        self[name] = refitted
-
-
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
@@ -124,7 +115,7 @@ def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
 
 
 def test_held_out_recordings_are_seen_about_the_torques_where_the_run_ended(solved):
-    problem, memory = Problem(lambda values: 7.0), Memory()
+    problem, memory = Problem(lambda values: 7.0), {}
     found = refit_with_effects(problem, [FRICTION], START, memory)
     assert problem.foreseen == solved.losses == [found.values]
     refit_with_effects(problem, [FRICTION], START, memory)
@@ -219,7 +210,7 @@ def test_a_stalled_search_needs_slopes_that_do_not_follow_each_stair_of_the_cost
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2})})
+    store = {"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2})}
     problem = Problem(lambda values: 5.0)
     found = refit_with_effects(problem, [FRICTION], START, store, FRICTION.label)
     assert solved.runs == []
@@ -236,7 +227,7 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
 
 
 def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
-    store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2})})
+    store = {"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2})}
     found = refit_with_effects(
         Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store, FRICTION.label
     )

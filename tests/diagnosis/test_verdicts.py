@@ -132,15 +132,14 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
     own = {f"joint_coulomb@{joint}": {"tau_c": 0.1} for joint in joints}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
-    coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
-    store = SimpleNamespace(stored_refit=lambda name: None, put=lambda name, fit: names.append(name))
+    coarse, store = Bench(bench.system, step_with_time_step(bench.step, 0.04)), {}
     candidates = ["joint_coulomb", "effort_offset"]
     finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], store=store)
     assert (finding.verdict, finding.stated_and_used_time_step) == (verdict, steps)
     assert {effect.label for effect in finding.accepted_effects} == set(own)
     is_finer = steps[0] != steps[1]
     assert ("Time steps of 0.04 s are too long" in finding.summary, finding.discretisation_chi2 > 0) == (is_finer,) * 2
-    assert ("the nominal model at 0.02 s" in names) is is_finer
+    assert ("the nominal model at 0.02 s" in store) is is_finer
     fit, true = finding.final_model, {"tau_c": 0.1, "damping": 0.05}
     wrong = [name for name, x in fit.values.items() if abs(x - true[name.rpartition(".")[2]]) > 2 * fit.std[name]]
     assert (wrong, finding.errors_in_std) == ([], ("time_step",))  # ± counts the step that was used

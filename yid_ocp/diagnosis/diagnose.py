@@ -23,7 +23,6 @@ from yid_ocp.diagnosis.events import EventSet, find_events, problem_corrected_fo
 from yid_ocp.diagnosis.gap_law import find_gap_law
 from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll
 from yid_ocp.diagnosis.refit import (
-    NO_REFIT_STORE,
     EffectSearchRecord,
     RefitContext,
     RefitStore,
@@ -62,7 +61,7 @@ def diagnose(
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
     progress: Progress = _LOG_PROGRESS,
     solution: Solution | None = None,
-    store: RefitStore = NO_REFIT_STORE,
+    store: RefitStore | None = None,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
     refit_solver: GaussNewton = REFIT_SOLVER,
@@ -84,8 +83,8 @@ def diagnose(
         Default: the package's log.
     solution : Solution, optional
         Solution of the nominal model from which its fit starts. Default: it is computed.
-    store : RefitStore
-        Finished refits of an interrupted diagnosis. It receives every new refit. Default: none.
+    store : mutable mapping of str to StoredFit, optional
+        Finished refits of an interrupted diagnosis by name. It receives every new refit.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
         them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
@@ -200,7 +199,7 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
 
 
 def _restarted(
-    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore = NO_REFIT_STORE
+    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore | None = None
 ) -> _Examined:
     """The nominal model, examined again on another problem."""
     search = replace(seen.search, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
@@ -444,7 +443,7 @@ def fit_nominal_model(
     problem: EstimationProblem,
     composed: AllCandidatesProblem,
     solution: Solution | None = None,
-    store: RefitStore = NO_REFIT_STORE,
+    store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""

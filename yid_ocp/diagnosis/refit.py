@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -44,18 +44,8 @@ class StoredFit:
     p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
 
 
-class RefitStore:
-    """A base class for stores of finished refits, which keeps nothing. Two threads call it."""
-
-    def stored_refit(self, name: str) -> StoredFit | None:
-        """Return the refit that is stored under a name, or None."""
-        return None
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name."""
-
-
-NO_REFIT_STORE = RefitStore()  # store of a diagnosis that no other one resumes
+RefitStore = MutableMapping[str, StoredFit]
+"""Finished refits by name. Two threads use it."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +122,7 @@ class RefitContext:
     problem: AllCandidatesProblem
     thresholds: Thresholds
     progress: Progress
-    store: RefitStore = NO_REFIT_STORE
+    store: RefitStore | None = None
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     n_batched: int = 1  # rollouts of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
@@ -220,7 +210,7 @@ def refit_with_effects(
     problem: AllCandidatesProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
-    store: RefitStore = NO_REFIT_STORE,
+    store: RefitStore | None = None,
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
@@ -230,7 +220,8 @@ def refit_with_effects(
     the time step are the name in the store of refits.
     """
     name = f"{name} at {problem.problem.step.time_step:g} s"
-    if stored := store.stored_refit(name):
+    known = {} if store is None else store
+    if stored := known.get(name):
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
@@ -253,7 +244,7 @@ def refit_with_effects(
     sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor))
-    store.put(name, found)
+    known[name] = found
     return _model(found, effects, own, finish, problem.held_out_spread)
 
 
