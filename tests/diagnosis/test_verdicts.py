@@ -56,8 +56,9 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     left = finding.single_effect_models[0].held_out_loss.chi2_per_sample
     assert told["single_effects"]["joint_coulomb@elbow"] == {"held_out_chi2_per_sample": left, "bic_difference": 0.0}
     assert min(entry["bic_difference"] for entry in told["single_effects"].values()) == 0.0, "no other is as likely"
-    [apart] = finding.transfer_checks
-    assert abs(apart.fitted[0] - apart.held_out[0]) < 4 * np.hypot(apart.fitted[1], apart.held_out[1])
+    again, name = finding.record.refits["joint_coulomb@elbow on the held-out recordings"], "joint_coulomb@elbow.tau_c"
+    pair = finding.single_effect_models[0], again
+    assert abs(np.diff([own.values[name] for own in pair])) < 4 * np.hypot(*(own.std[name] for own in pair))
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
     assert "\n  joint_coulomb@elbow: tau_c" in result["summary"]

@@ -532,7 +532,7 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     try:
         judged = judge(_RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record), case.evidence)
     except _UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, (), 0.0)
+        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, {}, 0.0, (), 0.0)
     places = (data["located_gap"]["locations"], data["remaining"])
     where, rest = (tuple(dataclass_from_plain_data(smoother.GapLocation, own) for own in part) for part in places)
     if judged.accepted_selected_effects:
