@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
@@ -257,13 +258,11 @@ def _overlap_fractions(effects: Sequence[EffectBase], information: Array) -> Arr
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram, blocks = information * scale[:, None] * scale, _columns(effects)
     inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
-    matrix = np.zeros((len(blocks), len(blocks)))
-    for j, row in enumerate(blocks):
-        size = max(float(np.trace(gram[np.ix_(row, row)])), 1e-300)
-        for i, column in enumerate(blocks):
-            cross = gram[np.ix_(row, column)]
-            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
-    return np.clip(matrix, 0.0, 1.0)
+    starts = [block[0] for block in blocks]
+    explained = gram @ scipy.linalg.block_diag(np.zeros((0, 0)), *inverses) * gram
+    sums = np.add.reduceat(np.add.reduceat(explained, starts, axis=0), starts, axis=1)
+    sizes = np.add.reduceat(np.diag(gram), starts)
+    return np.clip(sums / np.maximum(sizes, 1e-300)[:, None], 0.0, 1.0)
 
 
 @dataclass(frozen=True)
