@@ -407,5 +407,5 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
     composed = SimpleNamespace(with_smoothed_input_errors_of=lambda fitted: "composed", refit_solver=None)
-    assert diagnosing.fit_nominal_model("problem", composed, given) == start
+    assert diagnosing.fit_nominal_model("problem", RefitContext(composed, LIMITS, Heard()), given) == start
     assert len(asked) == solved

@@ -34,7 +34,7 @@ from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candi
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, next_step_texts, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
-from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress, count_with_noun
+from yid_ocp.display import LoggingProgress, Progress, count_with_noun
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
@@ -109,7 +109,7 @@ def diagnose(
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         # no name for the fit, whose Jacobian would fill the memory to the end
-        seen = _examined(search, fit_nominal_model(problem, composed, solution, store, thresholds))
+        seen = _examined(search, fit_nominal_model(problem, search, solution))
         return _diagnosed(problem, seen, earlier)
 
 
@@ -440,14 +440,10 @@ def _fitted_nominal_model(
 
 
 def fit_nominal_model(
-    problem: EstimationProblem,
-    composed: AllCandidatesProblem,
-    solution: Solution | None = None,
-    store: RefitStore | None = None,
-    limits: Thresholds = DEFAULT_THRESHOLDS,
+    problem: EstimationProblem, search: RefitContext, solution: Solution | None = None
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or fit_problem(problem, replace(REFIT_SOLVER, cost_tolerance=1e-8), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
-    composed = composed.with_smoothed_input_errors_of(solution.problem)
-    return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
+    composed = search.problem.with_smoothed_input_errors_of(solution.problem)
+    return _fitted_nominal_model(replace(search, problem=composed), start)

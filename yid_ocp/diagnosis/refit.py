@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.display import PartsDoneCounter, Progress, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test, whitening
@@ -120,8 +120,8 @@ class RefitContext:
     """The problem, thresholds, progress, store and deadline of a diagnosis. It makes the refits that rules request."""
 
     problem: AllCandidatesProblem
-    thresholds: Thresholds
-    progress: Progress
+    thresholds: Thresholds = DEFAULT_THRESHOLDS
+    progress: Progress = NULL_PROGRESS
     store: RefitStore | None = None
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     n_batched: int = 1  # rollouts of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
