@@ -332,7 +332,8 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
     again = of("spring@elbow", {"k": 7.0}, {"k": 0.1})
     first.values.update({"k": 3.0, "start.tip[own]": 0.2})
 
-    def refitted(problem, effects, start, store, name, limits):
+    def refitted(search, effects, start, name):
+        problem, store, limits = search.problem, search.store, search.thresholds
         asked.append((problem.problem.episodes, problem.problem.held_out, effects, dict(start), store, name, limits))
         return again
 

@@ -221,8 +221,8 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     kinds = ("joint_spring", "effort_offset")
     spring, offset = (next(e for e in made.candidate_effects if e.kind == kind) for kind in kinds)
     k, rest = "joint_spring@shoulder.stiffness", "joint_spring@shoulder.rest_angle"
-    found = refit_with_effects(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
-    other = refit_with_effects(made, [offset], nominal.values)
+    found = refit_with_effects(RefitContext(made), [spring], {**nominal.values, k: 0.3, rest: 1.0})
+    other = refit_with_effects(RefitContext(made), [offset], nominal.values)
     assert found.values[k] == pytest.approx(STRONG, abs=4 * found.std[k])
     assert found.values[rest] == pytest.approx(REST, abs=4 * found.std[rest])
     assert found.std[k] < 0.1 * STRONG
@@ -240,7 +240,7 @@ def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
     spring = next(e for e in made.candidate_effects if e.kind == "joint_spring")
     nominal = fit_nominal_model(problem, RefitContext(made))
     own = replace(made, problem=nominal.problem).with_step_of_only_effects([spring])
-    found = refit_with_effects(own, [spring], nominal.values)
+    found = refit_with_effects(RefitContext(own), [spring], nominal.values)
     assert found.problem.step is not made.problem.step
     search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), gap_law._neutral_law(found, "elbow", ("angle",))
     before, families = gap_law._refitted_families(search, problem, found, [sought], NO_EVENTS)

@@ -487,7 +487,8 @@ def true_effects_gap_closure(ensemble: BlindCaseGenerator, case: UnlabelledCase,
             if reported is not None:
                 start[f"{effect.label}.{quantity.name}"] = quantity.internal_from_reported_value(reported)
     # whitened as the nominal fit, like all models that it is compared with
-    fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
+    whitened = replace(composed, problem=nominal.problem)
+    fit = refit_with_effects(RefitContext(whitened), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):
         return math.nan
     return held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction

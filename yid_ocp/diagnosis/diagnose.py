@@ -105,7 +105,8 @@ def diagnose(
         deadline = begun + (thresholds.budget or math.inf)
         columns = len(composed.problem.unknowns.unknown_indices_affecting_recording(0))
         batched = len(composed.problem.episodes) * (columns <= MAX_BATCHED_COLUMNS)
-        search = RefitContext(composed, thresholds, progress, store, deadline, batched, stage_ends={"": begun})
+        refits = {} if store is None else store
+        search = RefitContext(composed, thresholds, progress, refits, deadline, batched, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         # no name for the fit, whose Jacobian would fill the memory to the end
@@ -170,8 +171,8 @@ def _has_left_start(fit: RefittedModel) -> bool:
     deviations = fit.evaluation.residual[rows] / problem.options.stated_std_factor
     initial = problem.unknowns.named_values(problem.initial_unknowns)
     known = [name for name in problem.shared_parameters if initial[name] > _FAR_IN_STDS * fit.std[name]]
-    is_far = any(not 1 / _FAR_RATIO < fit.values[name] / initial[name] < _FAR_RATIO for name in known)
-    return is_far or float(np.max(np.abs(deviations), initial=0.0)) > _FAR_IN_STDS
+    is_far = [not 1 / _FAR_RATIO < fit.values[name] / initial[name] < _FAR_RATIO for name in known]
+    return any([*is_far, *(np.abs(deviations) > _FAR_IN_STDS)])
 
 
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is_refitted: bool = False) -> _Examined:
@@ -199,7 +200,7 @@ def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
 
 
 def _restarted(
-    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore | None = None
+    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore
 ) -> _Examined:
     """The nominal model, examined again on another problem."""
     search = replace(seen.search, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
@@ -217,7 +218,7 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
         if problem is not None:
             beside = hypotheses.join_effect_labels(fits[-1].effects)
             seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
-            return _restarted(seen, problem, seen.nominal.values)
+            return _restarted(seen, problem, seen.nominal.values, {})
     fit = fits[-2:][0]  # the last of several effects may correct the error of the discretisation
     scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
     if scores is None:  # the effects leave only noise
@@ -246,7 +247,7 @@ def _with_changed_parameters(
         tried = [*released, left[0]]
         search.progress.begin_stage(f"trying a change of {' and '.join(tried)} since the baseline", 1.0, 8.5)
         free = _without_priors_of(search.problem, tried)
-        refitted = refit_with_effects(free, (), fit.values, limits=search.thresholds)
+        refitted = refit_with_effects(replace(search, problem=free, store={}), (), fit.values)
         if refitted is None:
             break
         fit, released = refitted, tried
@@ -268,7 +269,7 @@ def _with_changed_parameters(
             rival_probability=judged.probability - probability,
         )
     with contextlib.suppress(SolverError):
-        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
+        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values, {})
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
             return anew, judged
     return seen, judged
@@ -289,7 +290,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     if corrected is None:
         return seen
     problem = replace(seen.with_events, problem=corrected)
-    refitted = refit_with_effects(problem, fit.effects, fit.values, limits=seen.search.thresholds)
+    refitted = refit_with_effects(replace(seen.search, problem=problem, store={}), fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return seen
     gain = 2 * (fit.cost - refitted.cost)
@@ -297,7 +298,7 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     seen.search.progress.begin_stage(said)
     removed = problem.chi2_removed_by_discretisation + gain
     problem = replace(problem, is_corrected_for_links=True, chi2_removed_by_discretisation=removed)
-    return _restarted(seen, problem, refitted.values)
+    return _restarted(seen, problem, refitted.values, {})
 
 
 def _followed(search: RefitContext, nominal: RefittedModel) -> tuple[RefitContext, RefittedModel]:
@@ -434,7 +435,7 @@ def _fitted_nominal_model(
     nominal = problem.with_step_of_only_effects(())
     # a gap may move parameters so far that the solver's equilibrium is not found again from there
     for own in (start, {}):
-        if fit := refit_with_effects(nominal, (), own, search.store, name, search.thresholds):
+        if fit := refit_with_effects(replace(search, problem=nominal), (), own, name):
             return reevaluate_refit_with_all_candidates(problem, fit)
     raise failed_rollout_error("all fits fail, also from the initial values", "nominal model")
 
