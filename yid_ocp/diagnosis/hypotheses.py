@@ -335,10 +335,10 @@ def make_all_candidates_problem(
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    _exclude_candidates(effects, leave_out)  # reject names before compilation
+    kept = _exclude_candidates(effects, leave_out)  # rejects names before compilation
     progress.begin_stage(f"building one model with {count_with_noun(len(effects), 'candidate effect')}", ahead=19.5)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
-    return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
+    return replace(composed, candidate_effects=tuple(kept))
 
 
 def _states_of_part(whole: System, part: System) -> tuple[IntArray, IntArray]:
