@@ -34,7 +34,7 @@ from yid_ocp.diagnosis.blind_scores import diagnosis_evidence_to_dict, rejudge_d
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.files import make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
@@ -192,7 +192,7 @@ def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[Diagnosi
     )
     true = [effect for effect in composed.candidate_effects if effect.label in {w.label for w in case.withheld}]
     with threadpoolctl.threadpool_limits(1):
-        fit = refit_with_effects(composed, true, finding.nominal_model.values) if true else None
+        fit = refit_with_effects(RefitContext(composed), true, finding.nominal_model.values) if true else None
     return finding, seconds, math.nan if fit is None else fit.held_out_loss.chi2_per_sample
 
 

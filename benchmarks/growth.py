@@ -36,6 +36,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.files import write_strict_json
 from yid_ocp.integrator import compiled
@@ -146,7 +147,7 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     effects = make_candidate_effects(problem.system, [recording], "all")[:count]
     before = peak()
     composed = AllCandidatesProblem.from_problem(problem, effects)
-    nominal = fit_nominal_model(problem, composed)
+    nominal = fit_nominal_model(problem, RefitContext(composed))
     linearize_candidates(composed, (), nominal.values)  # compiles
     begun = time.process_time()
     linearize_candidates(composed, (), nominal.values)

@@ -22,7 +22,6 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import EffectAmplitudeTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import HeldOutGapClosure, HeldOutLoss, NullTestResult
 from yid_ocp.inference.smoother import GapLocation, SmoothedDisturbances, SmoothedUnknownsResult
@@ -167,9 +166,10 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=N
     )
 
 
-def carried(of: EffectBase, values=(0.5, 0.9), stds=(0.01, 0.02)) -> EffectAmplitudeTransferCheck:
-    """The amplitude of an effect on the recordings to estimate on and on the held-out ones."""
-    return EffectAmplitudeTransferCheck(of, f"{of.label}.a", *zip(values, stds, strict=True))
+def carried(*effects: EffectBase) -> dict[str, list[str]]:
+    """The amplitude of each effect on the recordings to estimate on and on the held-out ones."""
+    both = "0.5 ± 0.01 N m on the fitted recordings and 0.9 ± 0.02 N m on the held-out ones"
+    return {of.label: [f"{of.label}.a is {both}"] for of in effects}
 
 
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")
@@ -231,7 +231,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "screening": screening([score(of, p=0.3 if verdict == "no_gap" else 1e-9, decrease=100.0, statistic=40.0)]),
         "explained_fraction": 1.0,
         "probability": 0.9,
-        "transfer_checks": (),
+        "transfer_texts": {},
         "rival_shifts": (),
         "rival_probability": 0.0,
         "smoother_result": smoothed({FORCE: 9.0, BIAS: 9.0}, evidence={"plant": 9.0, "sensor": 9.0, "both": 20.0}),

@@ -12,7 +12,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.baseline import _estimated_without, problem_with_priors_and_baseline
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem.predictions import recording_from_prediction
@@ -153,12 +153,12 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     files = ("recordings.estimate=[again.h5]", "recordings.held_out=[bare.h5]")
     run = load_config(beam / "beam.yaml", (*files, "parameters.beam.damping.free=false"))
     problem = build_problem(run).with_parameter_values(TRUTH)
-    alone = refit_with_effects(AllCandidatesProblem(problem, (), False), (), {})
+    alone = refit_with_effects(RefitContext(AllCandidatesProblem(problem, (), False)), (), {})
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
     together, baseline = problem_with_priors_and_baseline(problem, known)
-    both = refit_with_effects(AllCandidatesProblem(together, (), False), (), {})
+    both = refit_with_effects(RefitContext(AllCandidatesProblem(together, (), False)), (), {})
     [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:

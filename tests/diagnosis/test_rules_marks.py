@@ -278,8 +278,8 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
         asked.append(held_out)
         return AllCandidatesProblem("from the start", tuple(effects), False)
 
-    def refit(composed, chosen, start):
-        asked.append((composed.problem, [e.kind for e in chosen], dict(start)))
+    def refit(search, chosen, start):
+        asked.append((search.problem.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
     nominal = fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")

@@ -80,15 +80,6 @@ class Problem:
         return costing(cost, self.rows)
 
 
-class Memory(dict):
-    """A store."""
-
-    stored_refit = dict.get
-
-    def put(self, name, refitted):
-        self[name] = refitted
-
-
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
@@ -118,16 +109,16 @@ def solved(monkeypatch):
 
 def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     problem = Problem(lambda values: 1.0)
-    refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
+    refit_with_effects(RefitContext(problem), [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
     # and once more where it ended, which is the same
     assert problem.at == 2 * [{**problem.named_values(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
 
 
 def test_held_out_recordings_are_seen_about_the_torques_where_the_run_ended(solved):
-    problem, memory = Problem(lambda values: 7.0), Memory()
-    found = refit_with_effects(problem, [FRICTION], START, memory)
+    problem, memory = Problem(lambda values: 7.0), {}
+    found = refit_with_effects(RefitContext(problem, store=memory), [FRICTION], START, FRICTION.label)
     assert problem.foreseen == solved.losses == [found.values]
-    refit_with_effects(problem, [FRICTION], START, memory)
+    refit_with_effects(RefitContext(problem, store=memory), [FRICTION], START, FRICTION.label)
     assert problem.foreseen == solved.losses == 2 * [found.values]
 
 
@@ -135,7 +126,7 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_run_ended(solv
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
     monkeypatch.setattr(module.whitening, "max_torque_bias_change_in_stds", lambda before, after: apart)
     monkeypatch.setattr(module.whitening, "problem_relinearized_at_torque_bias", lambda problem, x, frozen: problem)
-    refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
+    refit_with_effects(RefitContext(Problem(lambda values: 1.0)), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
 
 
@@ -144,14 +135,14 @@ START = {"k": 5.0, "k[run]": 6.0, "start.q.k[run]": 7.0, A: 0.75, S: 0.9}
 
 def test_a_refit_is_evaluated_where_it_ended(solved):
     problem = Problem(lambda values: 7.0)
-    found = refit_with_effects(problem, [FRICTION], START)
+    found = refit_with_effects(RefitContext(problem), [FRICTION], START)
     assert solved.runs == solved.losses == [found.values] == [START]
     assert found.cost == pytest.approx(7.0)
     assert found.std == dict.fromkeys(problem.unknown_names, 0.1)
     assert found.effects == (FRICTION,)
     assert problem.warmed == ["there"], "the shape at rest is looked for where it was"
     solved.known = costing(3.0, 10)  # there are no filters to linearise anew
-    assert refit_with_effects(problem, [FRICTION], START).cost == 3.0
+    assert refit_with_effects(RefitContext(problem), [FRICTION], START).cost == 3.0
     assert len(problem.asked) == 1
 
 
@@ -159,13 +150,13 @@ def test_a_refit_is_evaluated_where_it_ended(solved):
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back_towards_the_neutral_effect(solved, largest, drawn):
     limit = 9.0 if largest == 2.0 else largest
     problem = Problem(lambda values: 5.0 if values[A] <= limit else None)
-    found = refit_with_effects(problem, [FRICTION], {"k": 5.0, A: 2.25, S: 0.5})
+    found = refit_with_effects(RefitContext(problem), [FRICTION], {"k": 5.0, A: 2.25, S: 0.5})
     assert found.values[A] == pytest.approx(drawn)
     assert found.values["k"] == 5.0
 
 
 def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
-    assert refit_with_effects(Problem(lambda values: None), [FRICTION], START) is None
+    assert refit_with_effects(RefitContext(Problem(lambda values: None)), [FRICTION], START) is None
     assert solved.runs == []
     assert [run[A] for run in solved.failed] == pytest.approx([0.75, 0.5, 0.35, 0.275, 0.25])
 
@@ -197,11 +188,13 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
     for first, (cost, value) in {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}.items():
         there = {0.75: first, -0.75: 5.0}
         problem = Problem(lambda values, there=there: there.get(values[A]))
-        found = refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 0.75})
+        found = refit_with_effects(RefitContext(problem), [FRICTION], {"k": 2.0, A: 0.75})
         assert (found.cost, found.values[A]) == (pytest.approx(cost), value)
     # a worse one is not taken
     there = {0.75: 20.0, -0.75: 21.0}
-    found = refit_with_effects(Problem(lambda values: there.get(values[A], 30.0)), [FRICTION], {"k": 2.0, A: 0.75})
+    found = refit_with_effects(
+        RefitContext(Problem(lambda values: there.get(values[A], 30.0))), [FRICTION], {"k": 2.0, A: 0.75}
+    )
     assert found.values[A] == pytest.approx(0.75)
 
 
@@ -213,15 +206,15 @@ def test_a_stalled_search_needs_slopes_that_do_not_follow_each_stair_of_the_cost
     problem.evaluate = lambda x, *_, **how: evaluation(9 + slopes @ x + 1e-3 * np.sign(np.sin(1e4 * x[0])), slopes + 1)
     monkeypatch.setattr(module, "_refit_covariance_factor", lambda *a: known.append(a[1].jacobian) or 0.1 * np.eye(2))
     solved.status = status
-    refit_with_effects(problem, [FRICTION], {A: 0.78, S: 0.5})
+    refit_with_effects(RefitContext(problem), [FRICTION], {A: 0.78, S: 0.5})
     np.testing.assert_allclose(known[-1], slopes + stairs, atol=0.05)
 
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2})})
+    store = {"friction@elbow at 0.01 s": StoredFit(values, std, {FRICTION.label: 0.2})}
     problem = Problem(lambda values: 5.0)
-    found = refit_with_effects(problem, [FRICTION], START, store, FRICTION.label)
+    found = refit_with_effects(RefitContext(problem, store=store), [FRICTION], START, FRICTION.label)
     assert solved.runs == []
     assert (found.values, found.std, found.p_values) == (values, std, {FRICTION.label: 0.2})
     assert found.p_values == {FRICTION.label: 0.2}
@@ -229,16 +222,19 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     assert solved.losses == [values]
     assert problem.freed == (FRICTION,)
     # another start, or another time step, is another refit
-    assert refit_with_effects(problem, [FRICTION], START, store, "another").values == START
+    assert refit_with_effects(RefitContext(problem, store=store), [FRICTION], START, "another").values == START
     problem.step.time_step = 0.005
-    assert refit_with_effects(problem, [FRICTION], START, store, FRICTION.label).values == START
+    assert refit_with_effects(RefitContext(problem, store=store), [FRICTION], START, FRICTION.label).values == START
     assert [*store] == ["friction@elbow at 0.01 s", "another at 0.01 s", "friction@elbow at 0.005 s"]
 
 
 def test_a_stored_refit_that_cannot_be_rolled_out_is_solved_again(solved):
-    store = Memory({"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2})})
+    store = {"friction@elbow at 0.01 s": StoredFit({**START, A: 9.0}, START, {FRICTION.label: 0.2})}
     found = refit_with_effects(
-        Problem(lambda values: 5.0 if values[A] < 9.0 else None), [FRICTION], START, store, FRICTION.label
+        RefitContext(Problem(lambda values: 5.0 if values[A] < 9.0 else None), store=store),
+        [FRICTION],
+        START,
+        FRICTION.label,
     )
     assert solved.runs == [found.values] == [START]
     assert store["friction@elbow at 0.01 s"].values == found.values
@@ -248,8 +244,8 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     asked, heard = [], Heard()
     other, third, lost = effect("offset@elbow"), effect("third@x"), effect("lost@x")
 
-    def one(problem, effects, start, store, name, limits):
-        asked.append((problem, [e.kind for e in effects], start, store, name, limits))
+    def one(search, effects, start, name):
+        asked.append((search.problem, [e.kind for e in effects], start, search.store, name, search.thresholds))
         left = math.inf if effects[-1] is lost else 1.2345
         return None if effects[-1] is third else fit(effects, loss(left, left))
 
@@ -290,7 +286,7 @@ def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypa
     """Of ten seconds each, one after the other: four begin within 35 s."""
     now, tried, batches = [0.0], [((effect(f"{kind}@x"),), {}) for kind in "abcdef"], []
 
-    def one(problem, effects, start, store, name, limits):
+    def one(search, effects, start, name):
         now[0] += 10.0
         left = 9.0 - ord(effects[-1].kind)
         return fit(effects, loss(left, left))
@@ -416,5 +412,5 @@ def test_the_nominal_model_starts_from_the_solution(monkeypatch, known, start, s
     monkeypatch.setattr(diagnosing, "_fitted_nominal_model", lambda search, start: start)
     given = None if known is None else solution(known)
     composed = SimpleNamespace(with_smoothed_input_errors_of=lambda fitted: "composed", refit_solver=None)
-    assert diagnosing.fit_nominal_model("problem", composed, given) == start
+    assert diagnosing.fit_nominal_model("problem", RefitContext(composed, LIMITS, Heard()), given) == start
     assert len(asked) == solved

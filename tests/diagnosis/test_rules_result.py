@@ -118,8 +118,8 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     unsure = f.fit(
         [FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.5}, std={"friction@elbow.a": 0.3}
     )
-    chosen, checks = (f.added(FRICTION), f.added(OFFSET, fitted=unsure)), (f.carried(FRICTION), f.carried(OFFSET))
-    told = f.finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_checks=checks).to_dict()
+    chosen, checks = (f.added(FRICTION), f.added(OFFSET, fitted=unsure)), f.carried(FRICTION, OFFSET)
+    told = f.finding("unknown", unknown_reason="stand_in", selected_effects=chosen, transfer_texts=checks).to_dict()
     rejected = told["rejected_candidates"]
     assert next((own["kind"], own["location"], own["closure"]) for own in rejected) == ("friction", "elbow", 0.9)
     said = "friction@elbow.a is 0.5 ± 0.01 N m on the fitted recordings and 0.9 ± 0.02 N m on the held-out ones"

@@ -338,10 +338,11 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(screened(at).rank_candidate_pairs([a.label, b.label, c.label]))
+    seen = screened(at, detectable_at=0.1)
+    pairs = list(seen.rank_candidate_pairs(""))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = screened(at).rank_candidate_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = seen.rank_candidate_pairs("a@x")
     assert fewer == (b, c)
 
 
@@ -351,8 +352,9 @@ def test_pairs_promise_what_the_linear_model_of_both_does():
     columns = [rng.standard_normal((9, len(of.amplitude_parameter_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    everything = screened(point(residual, *made))
-    for pair, values, decrease in everything.rank_candidate_pairs([of.label for of in effects]):
+    pairs = screened(point(residual, *made), detectable_at=0.1).rank_candidate_pairs("")
+    assert len(pairs) == 3
+    for pair, values, decrease in pairs:
         x = np.hstack([columns[effects.index(of)] for of in pair])
         names = [name for of in pair for name in of.amplitude_parameter_names]
         own = [q for of in pair for q in of.definitions if not q.is_shape_parameter]

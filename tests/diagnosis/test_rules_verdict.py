@@ -261,10 +261,9 @@ def test_an_effect_is_accepted_if_its_size_is_known_beside_all_that_is_left(firs
     said = judgement([added(SPRING, fitted=one)], other)
     assert list(said.undetermined_sizes(LIMITS)) == ([] if known else ["spring@elbow"])
     assert (said.verdict, said.unknown_reason) == (("effect", "") if known else ("unknown", "stand_in"))
-    [entry] = said.transfer_checks
-    assert (entry.effect, entry.parameter) == (SPRING, "spring@elbow.k")
-    assert entry.fitted == first
-    assert entry.held_out == pytest.approx(second, nan_ok=True)
+    here, there = (f"{value:.4g} ± {std:.2g} N m on the" for value, std in (first, second))
+    text = f"spring@elbow.k is {here} fitted recordings and {there} held-out ones"
+    assert said.transfer_texts == {"spring@elbow": [text]}
 
 
 def test_one_part_of_a_vector_that_agrees_is_enough():
@@ -333,14 +332,15 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
     again = of("spring@elbow", {"k": 7.0}, {"k": 0.1})
     first.values.update({"k": 3.0, "start.tip[own]": 0.2})
 
-    def refitted(problem, effects, start, store, name, limits):
+    def refitted(search, effects, start, name):
+        problem, store, limits = search.problem, search.store, search.thresholds
         asked.append((problem.problem.episodes, problem.problem.held_out, effects, dict(start), store, name, limits))
         return again
 
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
-    [entry] = judgement([added(SPRING, fitted=first)], search=search).transfer_checks
-    assert (entry.fitted[0], entry.held_out[0]) == (2.0, 7.0)
+    [[text]] = judgement([added(SPRING, fitted=first)], search=search).transfer_texts.values()
+    assert ("is 2 ±" in text, "and 7 ±" in text) == (True, True)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
     assert start == {"k": 3.0, "spring@elbow.k": 2.0, "spring@elbow.s": 0.5}, "no start of a single recording"
@@ -352,7 +352,7 @@ def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, bloc
     asked = []
     monkeypatch.setattr("yid_ocp.diagnosis.refit.refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert judgement([added(SPRING)], search=search).transfer_checks == ()
+    assert judgement([added(SPRING)], search=search).transfer_texts == {}
     assert bool(asked) is not blocks
 
 

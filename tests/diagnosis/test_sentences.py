@@ -140,17 +140,17 @@ def unknown():
     unsure = (added(FRICTION, fitted=fit([FRICTION], values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": 0.3})),)
     for name, reason, changed in [
         ("little explained", "little", {"explained_fraction": 0.31, "gap_closure": closed(0.4, 0.29, 0.5)}),
-        ("imitates", "stand_in", {"selected_effects": unsure, "transfer_checks": (carried(FRICTION),)}),
+        ("imitates", "stand_in", {"selected_effects": unsure, "transfer_texts": carried(FRICTION)}),
         ("of a size that is not known", "stand_in", {"selected_effects": unsure}),
         *((f"two effects, {reason}", reason, {
             "selected_effects": (added(FRICTION), added(OFFSET, fitted=both)),
-            "explained_fraction": 0.31, "gap_closure": closed(0.4, 0.01, 0.7), "transfer_checks": (carried(OFFSET),),
+            "explained_fraction": 0.31, "gap_closure": closed(0.4, 0.01, 0.7), "transfer_texts": carried(OFFSET),
         }) for reason in REASONS),
     ]:  # fmt: skip
         limits = Thresholds(min_explained_fraction=0.5)
         yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
     for reason in REASONS:
-        none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_checks": (carried(FRICTION),)}
+        none = {"gap_closure": closed(math.nan, math.nan, math.nan), "transfer_texts": carried(FRICTION)}
         none |= {"selected_effects": unsure if reason == "stand_in" else (added(FRICTION),)}
         none |= {"nominal_held_out_test": outcome(), "remaining_test": outcome(), "explained_fraction": 0.31}
         yield f"no held-out gap, {reason}", finding("unknown", unknown_reason=reason, **none)
@@ -245,7 +245,7 @@ def test_nothing_impossible_is_said(closure, fitted, held_out, p, how):
     tests = {"nominal_test": outcome(p, chi2=fitted), "nominal_held_out_test": outcome(p, chi2=held_out)}
     known = {**tests, "gap_closure": closure, "nominal_model": fit(lost=lost)}
     verdict = how if how in ("effect", "no_gap") else "unknown"
-    none = NO_EFFECT if verdict == "no_gap" else {"transfer_checks": (carried(FRICTION),)}
+    none = NO_EFFECT if verdict == "no_gap" else {"transfer_texts": carried(FRICTION)}
     made = finding(verdict, **known, **none, **({} if verdict == how else {"unknown_reason": how}))
     assert_nothing_impossible_is_said(made, all_told(made))
 

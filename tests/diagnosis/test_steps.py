@@ -14,7 +14,7 @@ from made_series import series
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.pulse_detection import CompiledInverseDynamics
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.screening import changes_by_candidates_at_location, linearize_candidates, screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
@@ -27,7 +27,7 @@ def screened(bench):
     choice = ("effort_offset", "joint_coulomb", "joint_stribeck@elbow", "rotor_inertia@elbow", "link_mass@elbow")
     effects = make_candidate_effects(bench.system, recordings, choice)
     composed = AllCandidatesProblem.from_problem(problem, effects, recordings[1:])
-    nominal = refit_with_effects(composed, (), {})
+    nominal = refit_with_effects(RefitContext(composed), (), {})
     return composed, nominal, linearize_candidates(composed, (), nominal.values)
 
 
@@ -62,7 +62,7 @@ def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_doe
     by_label = {s.effect.label: s for s in ranked}
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
         effect = next(e for e in composed.candidate_effects if e.label == label)
-        fit = refit_with_effects(composed, (effect,), nominal.values)
+        fit = refit_with_effects(RefitContext(composed), (effect,), nominal.values)
         assert 2 * (nominal.cost - fit.cost) == pytest.approx(
             by_label[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3
         )
@@ -72,8 +72,8 @@ def test_an_effect_changes_as_forecast_if_the_best_candidate_at_its_location_is_
     composed, nominal, _ = screened
     known = {effect.label: effect for effect in composed.candidate_effects}
     base = tuple(known[label] for label in ("effort_offset@elbow", "effort_offset@shoulder"))
-    fit = refit_with_effects(composed, base, nominal.values)
-    more = refit_with_effects(composed, (*base, known["joint_coulomb@elbow"]), fit.values)
+    fit = refit_with_effects(RefitContext(composed), base, nominal.values)
+    more = refit_with_effects(RefitContext(composed), (*base, known["joint_coulomb@elbow"]), fit.values)
     forecast = changes_by_candidates_at_location(screen_candidates(composed, base, fit.values), base, 1e-6)
     name = "effort_offset@elbow.offset"
     assert forecast == {name: pytest.approx(more.values[name] - fit.values[name], rel=0.05)}
@@ -136,7 +136,7 @@ def test_readings_that_a_shorter_step_makes_worse_do_not_hide_others(monkeypatch
 
 
 def test_a_gap_without_a_cause_is_refitted_with_half_the_time_step(monkeypatch):
-    asked, seen = [], Mock(is_corrected_for_links=False)
+    asked, seen = [], Mock(with_events=Mock(is_corrected_for_links=False))
     seen.evidence.screening.largest_predicted_chi2_decrease, seen.search.thresholds.min_log_bayes_factor = 50.0, 5.0
     monkeypatch.setattr(diagnose, "_at_finer_step", lambda *_: None)
     fall = Mock(predicted_chi2_fall_at_finer_step=lambda *given: asked.append(given[-1]) or 26.0)

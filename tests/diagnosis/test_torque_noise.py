@@ -173,7 +173,7 @@ def test_states_that_no_error_reaches_are_left_out_of_a_filter():
 def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)
-    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
+    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), RefitContext(made))
     bare = problem_with_exact_inputs(made.problem)
     plain = bare.evaluate(bare.pack_unknowns(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
@@ -184,7 +184,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
 
 def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
-    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), composed(step, True))
+    fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), RefitContext(composed(step, True)))
     spread = noise_only_covariance_sqrt(fit.problem, fit.evaluation)
     off = fit.problem.pack_unknowns(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     assert null_tests_of_fit(fit.problem, off, fit.evaluation, 0.01)[1].p_value < 1e-12
@@ -216,13 +216,13 @@ def sprung(step, robot):
 def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
     """Its offset as the nominal model has it, some newton metres, is no error beside the spring."""
     problem, made = sprung
-    nominal = fit_nominal_model(problem, made)
+    nominal = fit_nominal_model(problem, RefitContext(made))
     made = replace(made, problem=nominal.problem)
     kinds = ("joint_spring", "effort_offset")
     spring, offset = (next(e for e in made.candidate_effects if e.kind == kind) for kind in kinds)
     k, rest = "joint_spring@shoulder.stiffness", "joint_spring@shoulder.rest_angle"
-    found = refit_with_effects(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
-    other = refit_with_effects(made, [offset], nominal.values)
+    found = refit_with_effects(RefitContext(made), [spring], {**nominal.values, k: 0.3, rest: 1.0})
+    other = refit_with_effects(RefitContext(made), [offset], nominal.values)
     assert found.values[k] == pytest.approx(STRONG, abs=4 * found.std[k])
     assert found.values[rest] == pytest.approx(REST, abs=4 * found.std[rest])
     assert found.std[k] < 0.1 * STRONG
@@ -238,9 +238,9 @@ def test_a_law_is_sought_at_another_joint_than_that_of_a_named_effect(sprung):
     """The named effect is refitted in the step of its own joint, which lacks the law."""
     problem, made = sprung
     spring = next(e for e in made.candidate_effects if e.kind == "joint_spring")
-    nominal = fit_nominal_model(problem, made)
+    nominal = fit_nominal_model(problem, RefitContext(made))
     own = replace(made, problem=nominal.problem).with_step_of_only_effects([spring])
-    found = refit_with_effects(own, [spring], nominal.values)
+    found = refit_with_effects(RefitContext(own), [spring], nominal.values)
     assert found.problem.step is not made.problem.step
     search, sought = RefitContext(made, Thresholds(), NULL_PROGRESS), gap_law._neutral_law(found, "elbow", ("angle",))
     before, families = gap_law._refitted_families(search, problem, found, [sought], NO_EVENTS)
@@ -322,7 +322,8 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     problem = problem_of(step, [recorded(step, 1, friction=friction)])
     found = fit_problem(problem, GaussNewton())
     effects = make_candidate_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
-    fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
+    made = AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)])
+    fit = fit_nominal_model(problem, RefitContext(made), found)
     std = found.parameters["elbow.stiffness"].std
     assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
     _, jacobian = residual_and_jacobian_with_stated_priors(fit.problem, fit.evaluation)

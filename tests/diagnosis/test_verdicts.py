@@ -56,8 +56,9 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     left = finding.single_effect_models[0].held_out_loss.chi2_per_sample
     assert told["single_effects"]["joint_coulomb@elbow"] == {"held_out_chi2_per_sample": left, "bic_difference": 0.0}
     assert min(entry["bic_difference"] for entry in told["single_effects"].values()) == 0.0, "no other is as likely"
-    [apart] = finding.transfer_checks
-    assert abs(apart.fitted[0] - apart.held_out[0]) < 4 * np.hypot(apart.fitted[1], apart.held_out[1])
+    again, name = finding.record.refits["joint_coulomb@elbow on the held-out recordings"], "joint_coulomb@elbow.tau_c"
+    pair = finding.single_effect_models[0], again
+    assert abs(np.diff([own.values[name] for own in pair])) < 4 * np.hypot(*(own.std[name] for own in pair))
     damping = finding.nominal_parameters_before_and_after["elbow.damping"]
     assert damping["before"] > damping["after"], "friction hides in the damping until it is named"
     assert "\n  joint_coulomb@elbow: tau_c" in result["summary"]
@@ -132,15 +133,14 @@ def test_the_error_of_a_long_step_is_no_gap_alone_or_beside_an_effect(bench, joi
     """Steps four times as long as those of the recordings; refits of the finer step have names of their own."""
     own = {f"joint_coulomb@{joint}": {"tau_c": 0.1} for joint in joints}
     recordings = [bench.recording(own, seed, duration=3.0) for seed in (1, 2)]
-    coarse, names = Bench(bench.system, step_with_time_step(bench.step, 0.04)), []
-    store = SimpleNamespace(stored_refit=lambda name: None, put=lambda name, fit: names.append(name))
+    coarse, store = Bench(bench.system, step_with_time_step(bench.step, 0.04)), {}
     candidates = ["joint_coulomb", "effort_offset"]
     finding = diagnose(coarse.problem(recordings[:1]), candidates, recordings[1:], store=store)
     assert (finding.verdict, finding.stated_and_used_time_step) == (verdict, steps)
     assert {effect.label for effect in finding.accepted_effects} == set(own)
     is_finer = steps[0] != steps[1]
     assert ("Time steps of 0.04 s are too long" in finding.summary, finding.discretisation_chi2 > 0) == (is_finer,) * 2
-    assert ("the nominal model at 0.02 s" in names) is is_finer
+    assert ("the nominal model at 0.02 s" in store) is is_finer
     fit, true = finding.final_model, {"tau_c": 0.1, "damping": 0.05}
     wrong = [name for name, x in fit.values.items() if abs(x - true[name.rpartition(".")[2]]) > 2 * fit.std[name]]
     assert (wrong, finding.errors_in_std) == ([], ("time_step",))  # ± counts the step that was used

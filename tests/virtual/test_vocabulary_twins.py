@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.effects.friction import effect_with_sign_smoothing_speed
@@ -164,7 +164,9 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     composed = AllCandidatesProblem.from_problem(nominal, [make_effect(kind, place, system)], runs[1:])
     start = fit_nominal_model(nominal, composed)
     [score] = screen_candidates(composed, (), start.values).candidate_scores
-    found = refit_with_effects(composed, composed.candidate_effects, {**start.values, **score.predicted_values})
+    found = refit_with_effects(
+        RefitContext(composed), composed.candidate_effects, {**start.values, **score.predicted_values}
+    )
     for name, reported in found.effects[0].to_reported_parameters(found.values, found.std).items():
         assert reported.value == pytest.approx(values[name], rel=0.01 if kind == "effort_gain" else 0.05), name
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample

@@ -176,7 +176,7 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
     refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1})
     with atomic_run_folder(load_config(rubbing), tmp_path / "run") as folder:
         first = _SingleJsonFileRefitStore(folder, *made_from)
-        first.put("joint_coulomb@elbow", refitted)
+        first["joint_coulomb@elbow"] = refitted
         if spoil == "inputs":
             made_from[0] = {"a.h5": "34"}
         elif spoil == "version":
@@ -186,8 +186,8 @@ def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp
         elif spoil == "other text":
             first.file.write_text("[1, 2]")
         second = _SingleJsonFileRefitStore(folder, *made_from)
-        assert second.stored_refit("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
-        assert second.stored_refit("joint_viscous@elbow") is None
+        assert second.get("joint_coulomb@elbow") == (refitted if spoil == "nothing" else None)
+        assert second.get("joint_viscous@elbow") is None
         assert len(caplog.records) == (0 if spoil == "nothing" else 1)
         folder.delete_resume_data(second.file)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -16,7 +16,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateNamesOrAll, make_candidate_effects
-from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, refit_with_effects
 from yid_ocp.diagnosis.screening import DETECTABLE_AMPLITUDE_Z, linearize_candidates
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import EffectBase, elastic_joints_of_segment
@@ -477,7 +477,7 @@ def true_effects_gap_closure(ensemble: BlindCaseGenerator, case: UnlabelledCase,
     problem = ensemble._nominal_problem(case.estimation_recordings)
     effects = make_candidate_effects(problem.system, case.estimation_recordings, ensemble.candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])
-    nominal = fit_nominal_model(problem, composed)
+    nominal = fit_nominal_model(problem, RefitContext(composed))
     true = {entry.label: entry.values for entry in label.injected}
     chosen = [effect for effect in composed.candidate_effects if effect.label in true]
     start = {}  # reported values in the parameters' own unit
@@ -487,7 +487,8 @@ def true_effects_gap_closure(ensemble: BlindCaseGenerator, case: UnlabelledCase,
             if reported is not None:
                 start[f"{effect.label}.{quantity.name}"] = quantity.internal_from_reported_value(reported)
     # whitened as the nominal fit, like all models that it is compared with
-    fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
+    whitened = replace(composed, problem=nominal.problem)
+    fit = refit_with_effects(RefitContext(whitened), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):
         return math.nan
     return held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction

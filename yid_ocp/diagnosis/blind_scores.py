@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.refit import EffectSearchRecord, RefitContext, RefitStati
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, CandidateDetectability, ScoreTestResult
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
-from yid_ocp.display import NULL_PROGRESS, effect_entry_label
+from yid_ocp.display import effect_entry_label
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.base import ParameterDefinition
 from yid_ocp.errors import DataError
@@ -530,9 +530,9 @@ def rejudge_diagnosis_evidence(data: Mapping[str, Any], changes: Mapping[str, An
     limits = replace(DEFAULT_THRESHOLDS, **(kept | dict(changes)))
     case = _RecordedCase(data)
     try:
-        judged = judge(_RecordedSearch(cast(Any, None), limits, NULL_PROGRESS, record=case.record), case.evidence)
+        judged = judge(_RecordedSearch(cast(Any, None), limits, record=case.record), case.evidence)
     except _UnrecordedRefitError:
-        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, (), 0.0, (), 0.0)
+        judged = Judgement(_NOT_JUDGED, "", (), (), 1.0, {}, 0.0, (), 0.0)
     places = (data["located_gap"]["locations"], data["remaining"])
     where, rest = (tuple(dataclass_from_plain_data(smoother.GapLocation, own) for own in part) for part in places)
     if judged.accepted_selected_effects:

@@ -21,9 +21,8 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, find_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
-from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll, HeldOutTruncation
+from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll
 from yid_ocp.diagnosis.refit import (
-    NO_REFIT_STORE,
     EffectSearchRecord,
     RefitContext,
     RefitStore,
@@ -35,7 +34,7 @@ from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, changes_by_candi
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, next_step_texts, recommended_experiment_text
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import Judgement, NominalModelGapEvidence, judge
-from yid_ocp.display import NULL_PROGRESS, LoggingProgress, Progress, count_with_noun
+from yid_ocp.display import LoggingProgress, Progress, count_with_noun
 from yid_ocp.errors import SolverError, failed_rollout_error
 from yid_ocp.inference import null_test, smoother
 from yid_ocp.inference.smoother import GapLocation, SmoothedUnknownsResult
@@ -62,7 +61,7 @@ def diagnose(
     thresholds: Thresholds = DEFAULT_THRESHOLDS,
     progress: Progress = _LOG_PROGRESS,
     solution: Solution | None = None,
-    store: RefitStore = NO_REFIT_STORE,
+    store: RefitStore | None = None,
     baseline: RunEstimates | Sequence[RunEstimates] | EarlierRunsBaseline = (),
     exclude: Sequence[str] = (),
     refit_solver: GaussNewton = REFIT_SOLVER,
@@ -84,8 +83,8 @@ def diagnose(
         Default: the package's log.
     solution : Solution, optional
         Solution of the nominal model from which its fit starts. Default: it is computed.
-    store : RefitStore
-        Finished refits of an interrupted diagnosis. It receives every new refit. Default: none.
+    store : mutable mapping of str to StoredFit, optional
+        Finished refits of an interrupted diagnosis by name. It receives every new refit.
     baseline : RunEstimates or sequence of RunEstimates, or EarlierRunsBaseline
         Estimates of earlier runs of the same model (`read_estimates`), used as priors unless the problem already has
         them: changes since then are diagnosed. An `EarlierRunsBaseline` can also hold reference recordings made without
@@ -106,11 +105,12 @@ def diagnose(
         deadline = begun + (thresholds.budget or math.inf)
         columns = len(composed.problem.unknowns.unknown_indices_affecting_recording(0))
         batched = len(composed.problem.episodes) * (columns <= MAX_BATCHED_COLUMNS)
-        search = RefitContext(composed, thresholds, progress, store, deadline, batched, stage_ends={"": begun})
+        refits = {} if store is None else store
+        search = RefitContext(composed, thresholds, progress, refits, deadline, batched, stage_ends={"": begun})
         search.record_stage_end_time("compose")
         progress.begin_stage("fitting the nominal model", 3.0, 15.5)
         # no name for the fit, whose Jacobian would fill the memory to the end
-        seen = _examined(search, fit_nominal_model(problem, composed, solution, store, thresholds))
+        seen = _examined(search, fit_nominal_model(problem, search, solution))
         return _diagnosed(problem, seen, earlier)
 
 
@@ -120,25 +120,16 @@ class _Examined:
 
     search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefittedModel
-    truncated: tuple[HeldOutTruncation, ...]
     with_events: AllCandidatesProblem  # before events were removed from the data
     events: EventSet
     smoothed: SmoothedUnknownsResult | None  # about the fit, on all its recordings, if it was run
     evidence: NominalModelGapEvidence
-    is_corrected_for_links: bool  # whether the data lack the error of the finite number of links
-    removed: float  # r'r that finer discretisations have removed
 
 
-def _examined(
-    search: RefitContext,
-    nominal: RefittedModel,
-    known: tuple[HeldOutTruncation, ...] = (),
-    is_corrected_for_links: bool = False,
-    removed: float = 0.0,
-) -> _Examined:
+def _examined(search: RefitContext, nominal: RefittedModel) -> _Examined:
     """Null tests and screening of the nominal model on data without events, at a discretisation that makes no gap."""
     limits = search.thresholds
-    search, nominal, cuts = _followed(search, nominal, known)
+    search, nominal = _followed(search, nominal)
     search.record_stage_end_time("nominal")
     search.progress.begin_stage("looking for events (pushes and wrong samples)", 4.0, 11.5)
     with_events = search.problem
@@ -155,13 +146,12 @@ def _examined(
     factor = noise_only_covariance_sqrt(own, nominal.evaluation)
     nominal = replace(nominal, held_out_loss=null_test.held_out_loss(own, nominal.unknowns, factor, spread, predicted))
     del predicted  # its derivatives would fill the memory
-    least = _LEFT_BY_DISCRETISATION * removed
+    least = _LEFT_BY_DISCRETISATION * composed.chi2_removed_by_discretisation
     evidence = NominalModelGapEvidence(nominal, test, held_out_test, EMPTY_SCREENING_RESULT)
     evidence = replace(evidence, discretisation_chi2=least, has_left_start=_has_left_start(nominal))
     ahead = 15.0 if evidence.residual_exceeds_noise(limits) else 1.5
     search.progress.begin_stage(f"screening {count_with_noun(len(effects), 'candidate effect')}", 4.0, ahead)
-    found = nominal, cuts, with_events, events, smoothed, evidence, is_corrected_for_links, removed
-    seen = _Examined(replace(search, problem=composed), *found)
+    seen = _Examined(replace(search, problem=composed), nominal, with_events, events, smoothed, evidence)
     try:
         screened = screen_candidates(composed, (), nominal.values)
     except SolverError:
@@ -181,8 +171,8 @@ def _has_left_start(fit: RefittedModel) -> bool:
     deviations = fit.evaluation.residual[rows] / problem.options.stated_std_factor
     initial = problem.unknowns.named_values(problem.initial_unknowns)
     known = [name for name in problem.shared_parameters if initial[name] > _FAR_IN_STDS * fit.std[name]]
-    is_far = any(not 1 / _FAR_RATIO < fit.values[name] / initial[name] < _FAR_RATIO for name in known)
-    return is_far or float(np.max(np.abs(deviations), initial=0.0)) > _FAR_IN_STDS
+    is_far = [not 1 / _FAR_RATIO < fit.values[name] / initial[name] < _FAR_RATIO for name in known]
+    return any([*is_far, *(np.abs(deviations) > _FAR_IN_STDS)])
 
 
 def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is_refitted: bool = False) -> _Examined:
@@ -191,7 +181,7 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
     `seen` if neither lowers r'r of a fit significantly and by half of a candidate's fall (`gap`), or after the links.
     `is_refitted`: only half the step is tried, by a refit, since a fit with long steps may lie in a wrong minimum.
     """
-    if seen.is_corrected_for_links:
+    if seen.with_events.is_corrected_for_links:
         return seen
     least = max(gap / 2, 2 * seen.search.thresholds.min_log_bayes_factor)
     if fit.problem.step.time_step > _LONGEST_FINAL_TIME_STEP:
@@ -206,18 +196,15 @@ def _at_finer_discretisation(seen: _Examined, fit: RefittedModel, gap: float, is
 def _at_half_time_step(seen: _Examined, why: str, fall: float) -> _Examined:
     h = seen.nominal.problem.step.time_step / 2
     seen.search.progress.begin_stage(f"starting again with time steps of {h:g} s, because {why}")
-    # the recordings are whole again, with their own data
-    anew = replace(seen, truncated=(), is_corrected_for_links=False, removed=seen.removed + fall)
-    return _restarted(anew, seen.with_events.with_half_time_step(), seen.nominal.values, seen.search.store)
+    return _restarted(seen, seen.with_events.with_half_time_step(fall), seen.nominal.values, seen.search.store)
 
 
 def _restarted(
-    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore = NO_REFIT_STORE
+    seen: _Examined, problem: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore
 ) -> _Examined:
-    """The nominal model, examined again on another problem; `seen` tells what has been changed before."""
+    """The nominal model, examined again on another problem."""
     search = replace(seen.search, problem=problem, store=store, record=EffectSearchRecord(), rounds=[])
-    told = seen.truncated, seen.is_corrected_for_links, seen.removed
-    return _examined(search, _fitted_nominal_model(search, start), *told)
+    return _examined(search, _fitted_nominal_model(search, start))
 
 
 def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
@@ -231,7 +218,7 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
         if problem is not None:
             beside = hypotheses.join_effect_labels(fits[-1].effects)
             seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
-            return _restarted(seen, problem, seen.nominal.values)
+            return _restarted(seen, problem, seen.nominal.values, {})
     fit = fits[-2:][0]  # the last of several effects may correct the error of the discretisation
     scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
     if scores is None:  # the effects leave only noise
@@ -260,7 +247,7 @@ def _with_changed_parameters(
         tried = [*released, left[0]]
         search.progress.begin_stage(f"trying a change of {' and '.join(tried)} since the baseline", 1.0, 8.5)
         free = _without_priors_of(search.problem, tried)
-        refitted = refit_with_effects(free, (), fit.values, limits=search.thresholds)
+        refitted = refit_with_effects(replace(search, problem=free, store={}), (), fit.values)
         if refitted is None:
             break
         fit, released = refitted, tried
@@ -282,7 +269,7 @@ def _with_changed_parameters(
             rival_probability=judged.probability - probability,
         )
     with contextlib.suppress(SolverError):
-        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values)
+        anew = _restarted(seen, _without_priors_of(seen.with_events, released), seen.nominal.values, {})
         if not anew.evidence.residual_exceeds_noise(search.thresholds):
             return anew, judged
     return seen, judged
@@ -303,20 +290,19 @@ def _without_error_of_links(seen: _Examined, fit: RefittedModel, least: float) -
     if corrected is None:
         return seen
     problem = replace(seen.with_events, problem=corrected)
-    refitted = refit_with_effects(problem, fit.effects, fit.values, limits=seen.search.thresholds)
+    refitted = refit_with_effects(replace(seen.search, problem=problem, store={}), fit.effects, fit.values)
     if refitted is None or not 2 * (fit.cost - refitted.cost) > least:
         return seen
     gain = 2 * (fit.cost - refitted.cost)
     said = f"starting again with data corrected for too few links, because twice the links lower chi2 by {gain:.3g}"
     seen.search.progress.begin_stage(said)
-    return _restarted(replace(seen, is_corrected_for_links=True, removed=seen.removed + gain), problem, refitted.values)
+    removed = problem.chi2_removed_by_discretisation + gain
+    problem = replace(problem, is_corrected_for_links=True, chi2_removed_by_discretisation=removed)
+    return _restarted(seen, problem, refitted.values, {})
 
 
-def _followed(
-    search: RefitContext, nominal: RefittedModel, known: tuple[HeldOutTruncation, ...]
-) -> tuple[RefitContext, RefittedModel, tuple[HeldOutTruncation, ...]]:
+def _followed(search: RefitContext, nominal: RefittedModel) -> tuple[RefitContext, RefittedModel]:
     """Truncate held-out recordings where the nominal model stops following them, and refit it if any was truncated."""
-    found = {cut.recording: cut for cut in known}
     for fraction in hypotheses.KEPT_HELD_OUT_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
@@ -324,11 +310,10 @@ def _followed(
         composed, cuts = composed.truncate_failing_held_out_recordings(nominal.values, fraction)
         for cut in cuts:
             search.progress.begin_stage(cut.sentence(nominal.problem.step.time_step))
-            found[cut.recording] = cut
         search = replace(search, problem=composed)
         name = f"the nominal model, limited to the part that it can follow ({fraction:g})"
         nominal = _fitted_nominal_model(search, nominal.values, name)
-    return search, nominal, tuple(found.values())
+    return search, nominal
 
 
 def _without_events(
@@ -385,7 +370,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
     final = reevaluate_refit_with_all_candidates(search.problem, last)
     if judged.verdict in ("no_gap", "effect", "confusable"):
         fine = _at_finer_step(search, final, events)
-        known = *final.at_estimates, final.std, final.effects, seen.is_corrected_for_links
+        known = *final.at_estimates, final.std, final.effects, search.problem.is_corrected_for_links
         std, counted = discretisation.stds_with_discretisation_and_encoder_errors(fine, *known)
         final = replace(final, std=std)
     if not accepted:
@@ -427,14 +412,14 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         remaining_gap_locations=rest,
         is_split_in_blocks=search.problem.is_split_in_blocks,
         thresholds=limits,
-        truncated_recordings=seen.truncated,
+        truncated_recordings=tuple(search.problem.truncated_recordings.values()),
         stage_seconds={name: ends[name] - ends[last] for last, name in itertools.pairwise(ends)},
         events=events,
         baseline_comparison=earlier.parameter_shifts_of_fit(final, limits),
         counterfactual=earlier.predict_counterfactual_errors(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         stated_and_used_time_step=(problem.step.time_step, nominal.problem.step.time_step),
-        is_corrected_for_links=seen.is_corrected_for_links,
+        is_corrected_for_links=search.problem.is_corrected_for_links,
         errors_in_std=counted,
         law=law,
     )
@@ -450,20 +435,16 @@ def _fitted_nominal_model(
     nominal = problem.with_step_of_only_effects(())
     # a gap may move parameters so far that the solver's equilibrium is not found again from there
     for own in (start, {}):
-        if fit := refit_with_effects(nominal, (), own, search.store, name, search.thresholds):
+        if fit := refit_with_effects(replace(search, problem=nominal), (), own, name):
             return reevaluate_refit_with_all_candidates(problem, fit)
     raise failed_rollout_error("all fits fail, also from the initial values", "nominal model")
 
 
 def fit_nominal_model(
-    problem: EstimationProblem,
-    composed: AllCandidatesProblem,
-    solution: Solution | None = None,
-    store: RefitStore = NO_REFIT_STORE,
-    limits: Thresholds = DEFAULT_THRESHOLDS,
+    problem: EstimationProblem, search: RefitContext, solution: Solution | None = None
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
     solution = solution or fit_problem(problem, replace(REFIT_SOLVER, cost_tolerance=1e-8), verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
-    composed = composed.with_smoothed_input_errors_of(solution.problem)
-    return _fitted_nominal_model(RefitContext(composed, limits, NULL_PROGRESS, store), start)
+    composed = search.problem.with_smoothed_input_errors_of(solution.problem)
+    return _fitted_nominal_model(replace(search, problem=composed), start)

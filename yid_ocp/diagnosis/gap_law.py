@@ -184,7 +184,7 @@ def _refitted_families(
     start = {name: value for name, value in last.values.items() if not name.startswith("start.")}
     composed, _ = composed.truncate_failing_held_out_recordings(start, KEPT_HELD_OUT_FRACTIONS[0])
     composed = composed.with_whitening_linearized_at(last.values, last.effects)
-    before = refit_with_effects(composed, last.effects, last.values, limits=search.thresholds)
+    before = refit_with_effects(replace(search, problem=composed, store={}), last.effects, last.values)
     if before is None:
         return None, []
     composed = replace(composed, problem=before.problem.with_free_parameters_without_recompiling(problem.free))
@@ -308,5 +308,6 @@ def _refitted(
     names = (*known.parameter_names, *family.law.parameters.names)
     prior = MultivariateGaussianPrior(names, scipy.linalg.block_diag(known.covariance, np.linalg.inv(family.precision)))
     with_prior = replace(composed, problem=composed.problem.with_replaced_multivariate_prior(prior))
+    context = replace(search, problem=with_prior, store={})
     effects: tuple[EffectBase, ...] = (*before.effects, family.law)
-    return refit_with_effects(with_prior, effects, {**before.values, **family.values}, limits=search.thresholds)
+    return refit_with_effects(context, effects, {**before.values, **family.values})

@@ -148,6 +148,9 @@ class AllCandidatesProblem:
     held_out_spread: Array | None = None  # change (n, k) of held-out residuals by one std of each nominal parameter
     # of screenings that share them, by point of the shape grid: changes of residual and, by unknown, Jacobian (n,)
     changes_by_encoder_noise: dict[int, list[tuple[Array, dict[str, Array]]]] = field(default_factory=dict)
+    truncated_recordings: Mapping[str, HeldOutTruncation] = field(default_factory=dict)  # by name of the recording
+    is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
+    chi2_removed_by_discretisation: float = 0.0  # r'r that finer steps and this correction have removed
 
     @staticmethod
     def from_problem(
@@ -226,12 +229,17 @@ class AllCandidatesProblem:
         made = self.problem.with_time_step(self.problem.step.time_step / 2)
         return _in_blocks(made) if self.is_split_in_blocks else made
 
-    def with_half_time_step(self) -> AllCandidatesProblem:
-        """Return the problem with half the time step and untruncated recordings, whitened by sensor noise alone."""
+    def with_half_time_step(self, removed_chi2: float) -> AllCandidatesProblem:
+        """Return the problem with half the time step, which removes `removed_chi2` of r'r.
+
+        Recordings are whole, with their own data, and whitened by sensor noise alone.
+        """
         made, held = self.estimated_at_half_time_step, self.problem.with_episodes(self.problem.held_out, ())
         if not self.is_split_in_blocks:
             made = made.with_episodes(made.episodes, held.with_time_step(made.step.time_step).episodes)
-        return replace(self, problem=made, held_out_spread=None)
+        removed = self.chi2_removed_by_discretisation + removed_chi2
+        anew = replace(self, problem=made, held_out_spread=None, chi2_removed_by_discretisation=removed)
+        return replace(anew, truncated_recordings={}, is_corrected_for_links=False)
 
     def with_smoothed_input_errors_of(self, fitted: EstimationProblem | None) -> AllCandidatesProblem:
         """Return the problem with the smoothed errors of torques and angles of a fit to the same recordings."""
@@ -281,7 +289,9 @@ class AllCandidatesProblem:
         if not cuts:
             return self, ()
         cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
-        return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
+        known, is_split = {own.recording: own for own in cuts}, self.is_split_in_blocks or not kept
+        told = {**self.truncated_recordings, **known}
+        return replace(self, problem=cut, is_split_in_blocks=is_split, truncated_recordings=told), tuple(cuts)
 
     def with_step_of_only_effects(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
         """Return the problem on a step of `effects` only (a third of the cost), unchanged if filters need others."""
@@ -325,10 +335,10 @@ def make_all_candidates_problem(
         hint = "set problem.weighting: whitened and the noise levels under `sensors`"
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    _exclude_candidates(effects, leave_out)  # reject names before compilation
+    kept = _exclude_candidates(effects, leave_out)  # rejects names before compilation
     progress.begin_stage(f"building one model with {count_with_noun(len(effects), 'candidate effect')}", ahead=19.5)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
-    return replace(composed, candidate_effects=tuple(_exclude_candidates(composed.candidate_effects, leave_out)))
+    return replace(composed, candidate_effects=tuple(kept))
 
 
 def _states_of_part(whole: System, part: System) -> tuple[IntArray, IntArray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.screening import EMPTY_SCREENING_RESULT, ScoredCandidatePair, ScreeningResult, screen_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.display import PartsDoneCounter, Progress, count_with_noun
+from yid_ocp.display import NULL_PROGRESS, PartsDoneCounter, Progress, count_with_noun
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference import null_test, whitening
@@ -44,18 +44,8 @@ class StoredFit:
     p_values: dict[str, float]  # by effect: p-value of its amplitudes, at fixed shape parameters
 
 
-class RefitStore:
-    """A base class for stores of finished refits, which keeps nothing. Two threads call it."""
-
-    def stored_refit(self, name: str) -> StoredFit | None:
-        """Return the refit that is stored under a name, or None."""
-        return None
-
-    def put(self, name: str, refitted: StoredFit) -> None:
-        """Store a refit under a name."""
-
-
-NO_REFIT_STORE = RefitStore()  # store of a diagnosis that no other one resumes
+RefitStore = MutableMapping[str, StoredFit]
+"""Finished refits by name. Two threads use it."""
 
 
 @dataclass(frozen=True)
@@ -130,9 +120,9 @@ class RefitContext:
     """The problem, thresholds, progress, store and deadline of a diagnosis. It makes the refits that rules request."""
 
     problem: AllCandidatesProblem
-    thresholds: Thresholds
-    progress: Progress
-    store: RefitStore = NO_REFIT_STORE
+    thresholds: Thresholds = DEFAULT_THRESHOLDS
+    progress: Progress = NULL_PROGRESS
+    store: RefitStore = field(default_factory=dict)
     deadline: float = math.inf  # value of `time.perf_counter` after which no further refit starts [s]
     n_batched: int = 1  # rollouts of a refit: its recordings, or 0 if batches do not pay and waiting fits fill memory
     skipped: list[str] = field(default_factory=list)  # skipped steps, shared by all copies of this context
@@ -153,8 +143,8 @@ class RefitContext:
 
     def refit(self, effects: Sequence[EffectBase], start: Mapping[str, float], name: str) -> RefitStatistics | None:
         """Refit the model with the given effects. None if no simulation succeeds. `name` distinguishes the starts."""
-        how = (effects, start, self.store, name, self.thresholds)
-        return self._answer(self.record.refits, name, lambda: refit_with_effects(self._problem_of_round(effects), *how))
+        how = effects, start, name
+        return self._answer(self.record.refits, name, lambda: refit_with_effects(self._of_round(effects), *how))
 
     def refit_on_held_out(self, fit: RefitStatistics) -> RefitStatistics | None:
         """Fit the effects of `fit` again, on the held-out recordings. None if that is not possible."""
@@ -164,7 +154,7 @@ class RefitContext:
             if self.problem.is_split_in_blocks:
                 return None
             self.progress.begin_stage("fitting the same effects to the held-out recordings", 1.0, 5.5)
-            composed = self._problem_of_round(fit.effects)
+            composed = self._of_round(fit.effects).problem
             problem = composed.problem
             exchanged = problem.with_episodes(problem.held_out, problem.episodes)
             # parameters shared by both sets of recordings, without initial states
@@ -172,19 +162,19 @@ class RefitContext:
             start = {name: fit.values[name] for name in fit.values.keys() & names}
             composed = replace(composed, problem=exchanged, held_out_spread=None)
             whitened = composed.with_whitening_linearized_at(fit.values, fit.effects)
-            return refit_with_effects(whitened, fit.effects, start, self.store, name, self.thresholds)
+            return refit_with_effects(replace(self, problem=whitened), fit.effects, start, name)
 
         return self._answer(self.record.refits, name, turned)
 
-    def _problem_of_round(self, effects: Sequence[EffectBase]) -> AllCandidatesProblem:
-        """The problem with the effects of the first round that has all the given ones, or with all candidates."""
+    def _of_round(self, effects: Sequence[EffectBase]) -> RefitContext:
+        """The context with the effects of the first round that has all the given ones, or with all candidates."""
         problem = self.problem.problem
         for own, count in self.rounds:
             left_out = count * len(problem.episodes) * (len(problem.system.effects) - len(own))
             has_all = {effect.label for effect in effects} <= {effect.label for effect in own}
             if has_all and left_out >= _MIN_LEFT_OUT_FOR_OWN_STEP:
-                return self.problem.with_step_of_only_effects(own)
-        return self.problem
+                return replace(self, problem=self.problem.with_step_of_only_effects(own))
+        return self
 
     def screen(self, base: Sequence[EffectBase], values: Mapping[str, float], name: str) -> ScreeningResult:
         """Test all candidates as additions to the effects in `base`. `name` says which fit provides `values`.
@@ -201,9 +191,8 @@ class RefitContext:
 
     def rank_candidate_pairs(self, screened: ScreeningResult, without: str) -> list[ScoredCandidatePair]:
         """Rank the most promising pairs of candidates, except the label `without`. See `_MAX_RECORDED_PAIRS`."""
-        labels = {score.effect.label for score in screened.candidate_scores} - {without}
         ranked = screened.rank_candidate_pairs
-        return self._answer(self.record.pairs, without, lambda: ranked(labels)[:_MAX_RECORDED_PAIRS])
+        return self._answer(self.record.pairs, without, lambda: ranked(without)[:_MAX_RECORDED_PAIRS])
 
     def _answer(self, answers: dict[str, Any], name: str, work: Callable[[], _Answer]) -> _Answer:
         found = work()
@@ -218,20 +207,16 @@ _Attempt = tuple[EstimationProblem, SolverResult, Evaluation]
 
 
 def refit_with_effects(
-    problem: AllCandidatesProblem,
-    effects: Sequence[EffectBase],
-    start: Mapping[str, float],
-    store: RefitStore = NO_REFIT_STORE,
-    name: str = "",
-    limits: Thresholds = DEFAULT_THRESHOLDS,
+    search: RefitContext, effects: Sequence[EffectBase], start: Mapping[str, float], name: str = ""
 ) -> RefittedModel | None:
     """Fit nominal and effect parameters together, then predict held-out recordings. None if no rollout succeeds.
 
     `start` holds the initial unknowns. If the rollout fails there, they are moved towards neutral effects. `name` and
     the time step are the name in the store of refits.
     """
+    problem, limits = search.problem, search.thresholds
     name = f"{name} at {problem.problem.step.time_step:g} s"
-    if stored := store.stored_refit(name):
+    if stored := search.store.get(name):
         placed, at_stored = _evaluated(problem, effects, stored.values)
         if at_stored.ok:
             return _model(stored, effects, placed, at_stored, problem.held_out_spread)
@@ -254,7 +239,7 @@ def refit_with_effects(
     sizes = own.unknowns.named_values(np.linalg.norm(factor, axis=1))
     std = {name: math.inf if size > most.get(name, math.inf) else size for name, size in sizes.items()}
     found = StoredFit(values, std, _effect_p_values(effects, own.unknown_names, outcome.x, factor))
-    store.put(name, found)
+    search.store[name] = found
     return _model(found, effects, own, finish, problem.held_out_spread)
 
 

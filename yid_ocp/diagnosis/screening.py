@@ -13,10 +13,11 @@ has the derivation.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.linalg
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
@@ -257,13 +258,11 @@ def _overlap_fractions(effects: Sequence[EffectBase], information: Array) -> Arr
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram, blocks = information * scale[:, None] * scale, _columns(effects)
     inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
-    matrix = np.zeros((len(blocks), len(blocks)))
-    for j, row in enumerate(blocks):
-        size = max(float(np.trace(gram[np.ix_(row, row)])), 1e-300)
-        for i, column in enumerate(blocks):
-            cross = gram[np.ix_(row, column)]
-            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
-    return np.clip(matrix, 0.0, 1.0)
+    starts = [block[0] for block in blocks]
+    explained = gram @ scipy.linalg.block_diag(np.zeros((0, 0)), *inverses) * gram
+    sums = np.add.reduceat(np.add.reduceat(explained, starts, axis=0), starts, axis=1)
+    sizes = np.add.reduceat(np.diag(gram), starts)
+    return np.clip(sums / np.maximum(sizes, 1e-300)[:, None], 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -277,7 +276,6 @@ class ScreeningResult:
     candidate_scores: tuple[ScoreTestResult, ...]  # of the detectable ones, largest predicted decrease of r'r first
     # shape (nj, nj), in the order of `detectability`: of row j's signature, beyond nominal parameters, by column i's
     overlap_fractions: Array
-    shape_values: tuple[dict[str, float], ...]  # of each candidate
     information: Array  # X'X of all signatures side by side, shape (n, n)
     score_vector: Array  # -X'r, shape (n,)
 
@@ -301,24 +299,25 @@ class ScreeningResult:
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
-    def rank_candidate_pairs(self, among: Collection[str]) -> list[ScoredCandidatePair]:
-        """List all pairs of the candidates `among`, ordered by penalised decrease of r'r (r: whitened residual).
+    def rank_candidate_pairs(self, without: str) -> list[ScoredCandidatePair]:
+        """List all pairs of scored candidates, except the label `without`, by penalised decrease of r'r (r: residual).
 
         Two effects together can explain a residual that neither explains alone, because each masks the other.
         """
         effects = [entry.effect for entry in self.detectability]
-        every = zip(effects, self.shape_values, _columns(effects), strict=True)
-        wanted = [(effect, shape, at, _room(effect)) for effect, shape, at in every if effect.label in among]
+        scored = {score.effect.label: score.predicted_values for score in self.candidate_scores}
+        every, among = zip(effects, _columns(effects), strict=True), scored.keys() - {without}
+        wanted = [(effect, at, _room(effect)) for effect, at in every if effect.label in among]
         found: list[ScoredCandidatePair] = []
-        for (one, shape, first, room), (other, its_shape, second, its_room) in itertools.combinations(wanted, 2):
+        for (one, first, room), (other, second, its_room) in itertools.combinations(wanted, 2):
             at, both = np.concatenate([first, second]), np.concatenate([room, its_room], axis=1)
             step, decrease = _promised(self.information[at[:, None], at], self.score_vector[at], both)
             values = _values(one, step[: len(first)]) | _values(other, step[len(first) :])
-            found.append(((one, other), values | shape | its_shape, decrease - len(at)))
+            found.append(((one, other), scored[one.label] | scored[other.label] | values, decrease - len(at)))
         return sorted(found, key=lambda pair: -pair[-1])
 
 
-EMPTY_SCREENING_RESULT = ScreeningResult((), (), np.zeros((0, 0)), (), np.zeros((0, 0)), np.zeros(0))
+EMPTY_SCREENING_RESULT = ScreeningResult((), (), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 """Screening where the model cannot be simulated: no candidate is known there."""
 
 
@@ -346,8 +345,8 @@ def screen_candidates(
     every = np.hstack([np.zeros((len(residual), 0)), *(own.projected_sensitivity for own in kept)])
     slope = np.concatenate([np.zeros(0), *(own.score_bias for own in kept)]) - every.T @ residual
     ranked, information = sorted(scores, key=lambda own: -own.predicted_chi2_decrease), every.T @ every
-    overlaps, shapes = _overlap_fractions([own.effect for own in kept], information), (own.shape_values for own in kept)
-    return ScreeningResult(tuple(visible), tuple(ranked), overlaps, tuple(shapes), information, slope)
+    overlaps = _overlap_fractions([own.effect for own in kept], information)
+    return ScreeningResult(tuple(visible), tuple(ranked), overlaps, information, slope)
 
 
 def changes_by_candidates_at_location(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from yid_ocp.diagnosis.baseline import ParameterShift
@@ -10,38 +11,12 @@ from yid_ocp.diagnosis.refit import RefitContext, RefitStatistics
 from yid_ocp.diagnosis.screening import ScreeningResult
 from yid_ocp.diagnosis.select import SelectedEffect, select_effects, total_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.display import grouped
-from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 from yid_ocp.problem.options import ExcessResidualCriteria
 
 _LOGISTIC_OFFSET, _LOGISTIC_SLOPE = -0.2, 0.8  # of the log odds over the logarithm of what is unexplained
 _MIN_UNEXPLAINED = 0.02  # fraction of the gap below which the rest is noise
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
-
-
-@dataclass(frozen=True)
-class EffectAmplitudeTransferCheck:
-    """A comparison of two estimates of one effect parameter, from the estimation and the held-out recordings."""
-
-    effect: EffectBase
-    parameter: str  # with the label of the effect
-    fitted: tuple[float, float]  # value and standard deviation
-    held_out: tuple[float, float]
-
-    @property
-    def text(self) -> str:
-        """A text with both estimates."""
-        unit = f" {self.effect.parameters[self.parameter].unit}".removesuffix(" 1")
-        here, there = (f"{value:.4g} ± {std:.2g}{unit}" for value, std in (self.fitted, self.held_out))
-        return f"{self.parameter} is {here} on the fitted recordings and {there} on the held-out ones"
-
-    @property
-    def significant_disagreement_as_std(self) -> float:
-        """The difference of the estimates divided by sqrt(2) if it is significant, else 0."""
-        (here, std), (there, other_std) = self.fitted, self.held_out
-        apart, spread = abs(here - there), math.hypot(std, other_std)
-        return apart / math.sqrt(2.0) if apart > _DISAGREEMENT_Z * spread else 0.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +64,7 @@ class Judgement:
     single_effect_models: tuple[RefitStatistics, ...]  # refits of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
     explained_fraction: float  # decrease of r'r by the effects over its excess over noise
-    transfer_checks: tuple[EffectAmplitudeTransferCheck, ...]
+    transfer_texts: Mapping[str, Sequence[str]]  # amplitudes on the fitted and the held-out recordings, by effect
     probability: float  # that the selected effects, or effects that are equivalent to them, are the cause
     rival_shifts: tuple[ParameterShift, ...]  # since a baseline, which explain about as much as the effects
     rival_probability: float  # that these shifts are the cause
@@ -103,8 +78,7 @@ class Judgement:
         """Both estimates, as texts, of the effects within `min_z` stds (which include the gap) of neutral, by label."""
         effects, fits = [e.effect for e in self.selected_effects], [e.refitted_model for e in self.selected_effects]
         unsure = [own.label for own in effects if not fits[-1].determines_size(own, limits.min_z)]
-        texts = grouped((check.effect.label, check.text) for check in self.transfer_checks)
-        return {label: texts.get(label, []) for label in unsure}
+        return {label: [*self.transfer_texts.get(label, ())] for label in unsure}
 
     @property
     def accepted_effects_closure_by_location(self) -> dict[str, float]:
@@ -142,15 +116,14 @@ def judge(search: RefitContext, evidence: NominalModelGapEvidence) -> Judgement:
         fits, added, beside = select_effects(search, nominal, evidence.screening, *has_left)
     search.record_stage_end_time("refits")
 
-    carried, explained = tuple[EffectAmplitudeTransferCheck, ...](), 1.0
+    texts, explained = dict[str, list[str]](), 1.0
     if added:
         last = added[-1].refitted_model
         explained = _explained_fraction(nominal, last, limits)
-        carried = _check_effect_amplitude_transfer(search, last)
-        apart = {own.parameter: own.significant_disagreement_as_std for own in carried}
+        apart, texts = _differences_as_std_and_texts(search, last)
         std = {name: max(std, beside.get(name, 0.0), apart.get(name, 0.0)) for name, std in last.std.items()}
         added = (*added[:-1], replace(added[-1], refitted_model=replace(last, std=std)))
-    said = Judgement("", "", fits, added, explained, carried, 0.0, (), 0.0)
+    said = Judgement("", "", fits, added, explained, texts, 0.0, (), 0.0)
     reasons = _reasons_against(said, limits)
     reason = next((name for name, holds in reasons.items() if holds), "")
     # a gap that is seen only along a candidate's signature counts only with an accepted effect
@@ -195,17 +168,23 @@ def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits:
     return 1.0 if max(is_left) < limits.min_excess_chi2_per_dof else decrease / excess
 
 
-def _check_effect_amplitude_transfer(
+def _differences_as_std_and_texts(
     search: RefitContext, fit: RefitStatistics
-) -> tuple[EffectAmplitudeTransferCheck, ...]:
+) -> tuple[dict[str, float], dict[str, list[str]]]:
     """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
-    Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
+    Returns the differences that are significant, divided by sqrt(2), and texts with both estimates, by effect. Empty if
+    one recording is split, or if the refit fails; neither is evidence against an effect.
     """
+    apart, texts = dict[str, float](), dict[str, list[str]]()
     if (again := search.refit_on_held_out(fit)) is None:
-        return ()
-    names = ((effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names)
-    return tuple(
-        EffectAmplitudeTransferCheck(effect, name, *((own.values[name], own.std[name]) for own in (fit, again)))
-        for effect, name in names
-    )
+        return apart, texts
+    for effect, name in ((own, name) for own in fit.effects for name in own.amplitude_parameter_names):
+        unit = f" {effect.parameters[name].unit}".removesuffix(" 1")
+        here, there = (f"{own.values[name]:.4g} ± {own.std[name]:.2g}{unit}" for own in (fit, again))
+        text = f"{name} is {here} on the fitted recordings and {there} on the held-out ones"
+        texts.setdefault(effect.label, []).append(text)
+        difference = abs(fit.values[name] - again.values[name])
+        if difference > _DISAGREEMENT_Z * math.hypot(fit.std[name], again.std[name]):
+            apart[name] = difference / math.sqrt(2.0)
+    return apart, texts

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import threading
+from collections import UserDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnose import diagnose
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, make_candidate_effects
-from yid_ocp.diagnosis.refit import RefitStore, RefittedModel, StoredFit
+from yid_ocp.diagnosis.refit import RefittedModel, StoredFit
 from yid_ocp.display import NULL_PROGRESS, Progress
 from yid_ocp.effects import EFFECTS
 from yid_ocp.effects.law import torque_law_tables_csv
@@ -309,31 +310,28 @@ def _unknown_force_scene(finding: DiagnosisResult) -> list[AnimationData]:
     return [animation_of_trajectories(f"{episode.name} (unknown forces)", [course], episode.recording)]
 
 
-class _SingleJsonFileRefitStore(RefitStore):
+class _SingleJsonFileRefitStore(UserDict[str, StoredFit]):
     """A store of refits in one JSON file, replaced as a whole after every refit."""
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
+        super().__init__()
         self.file = folder.resume_folder / "refits.json"
         self._folder, self._key = folder, files.json_sha256(made_from)
         self._lock, self._warned = threading.Lock(), False
-        self._known = self._read()
+        self.data = self._read()
 
-    def __len__(self) -> int:
-        return len(self._known)
-
-    def stored_refit(self, name: str) -> StoredFit | None:
-        """Return the stored refit of that name, or None. Reuse is logged."""
-        found = self._known.get(name)
-        if found is not None:
-            self._folder.log_event("resumed", refit=name)
+    def __getitem__(self, name: str) -> StoredFit:
+        """Return the stored refit of that name. Reuse is logged."""
+        found = super().__getitem__(name)
+        self._folder.log_event("resumed", refit=name)
         return found
 
-    def put(self, name: str, refitted: StoredFit) -> None:
+    def __setitem__(self, name: str, refitted: StoredFit) -> None:
         with self._lock:
-            self._known[name] = refitted
+            self.data[name] = refitted
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                data = {"format": _STORE_FORMAT, "key": self._key, "refits": files.to_lossless_plain_data(self._known)}
+                data = {"format": _STORE_FORMAT, "key": self._key, "refits": files.to_lossless_plain_data(self.data)}
                 files.write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
