@@ -314,7 +314,7 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     lines = told("yid-diagnosis/2", result | fitted)
     words = [" ".join(line_of(lines, f"kelvin_voigt@T{i}").split()[-3:]) for i in (1, 2, 3)]
     assert words == ["% < 1e-12", "% 0.0034 possible", "forecast) 0.5 possible"]
-    assert "tau = 0.05 s  not fitted (values: forecast)" in line_of(lines, "kelvin_voigt@T3")
+    assert "tau = 0.05 s  not fitted alone (values: forecast)" in line_of(lines, "kelvin_voigt@T3")
     assert not any("kelvin_voigt" in line for line in told("yid-diagnosis/2", result)), "none was fitted"
     unseen = ["slip@grasp", *(f"{kind}@j{i}" for kind in ("friction", "mass", "lag", "gain") for i in range(1, 8))]
     lines = told("yid-diagnosis/2", result | {"unseen": unseen})
@@ -323,6 +323,9 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     alike = {"which": [entry | {"closure": 0.5, "p_value": 0.0}], "effects": [entry]}
     refitted, named = (told("yid-diagnosis/2", result | alike | {"verdict": own}) for own in ("confusable", "effect"))
     assert [line_of(own, "kelvin_voigt@T1").split()[-1] for own in (refitted, named)] == ["possible", "accepted"]
+    provisional = told("yid-diagnosis/2", result | alike | {"verdict": "effect", "probability": 0.4})
+    assert provisional[0].startswith("Verdict (provisional): effect."), "and no meaning of the kind follows"
+    assert line_of(provisional, "kelvin_voigt@T1").endswith("possible")
     beside = told("yid-diagnosis/2", result | {"effects": which[1:], "verdict": "effect"})
     assert "fitted beside others only  0.0034  " in line_of(beside, "kelvin_voigt@T2")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")

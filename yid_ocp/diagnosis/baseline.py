@@ -92,9 +92,12 @@ class ParameterShiftsSinceBaseline:
         p = self.between_runs_p_value
         differ = f"The earlier runs differ from each other by more than their ± (p = {p:.2g} < {_RUNS_DIFFER_LEVEL:g})."
         small = "The model did not explain the recordings of the baseline, so the ± of the baseline may be too small."
+        same = "No parameter differs significantly from the baseline (the earlier runs)."
+        unseen = "These recordings do not show whether a parameter differs from the baseline (the earlier runs)."
+        is_seen = any(own.z_score is not None for own in self.parameter_shifts)
         return texts_that_hold(
             (moved and not has_rivals, changed),
-            (not moved and not has_rivals, "No parameter differs significantly from the baseline (the earlier runs)."),
+            (not moved and not has_rivals, same if is_seen else unseen),
             (p < _RUNS_DIFFER_LEVEL, f"{differ} The ± of the baseline includes this."),
             (not self.is_baseline_explained, small),
         )

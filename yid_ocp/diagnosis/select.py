@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import EffectsWithStart, RefitContext, RefitStatistics, refit_with_each_effect
 from yid_ocp.diagnosis.screening import ScreeningResult
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.thresholds import NEED_TEST, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 
@@ -240,7 +240,7 @@ def _reconsidered(
     tried = {frozenset[str](), frozenset(effect.label for effect in before.effects)}
     labels = frozenset(effect.label for effect in fit.effects)
     while own := next((effect for effect in fit.effects if labels - {effect.label} not in tried), None):
-        if search.is_skipped_past_deadline("whether every effect is needed"):
+        if search.is_skipped_past_deadline(NEED_TEST):
             break
         tried.add(labels - {own.label})
         fit = _revised(search, nominal, fit, own, rivals)

@@ -8,7 +8,7 @@ import numpy as np
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.thresholds import NEED_TEST, Thresholds, is_provisional
 from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.display import texts_that_hold as _said
@@ -115,8 +115,12 @@ def _lead(result: DiagnosisResult) -> str:
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
     none = f"{use} There is no relevant gap: {sizes} ({chance}). The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
-    equal = "several causes explain the model's error about equally well"
-    why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
+    why = _said(
+        (untested, "the search ended before it had tested every probable cause"),
+        (NEED_TEST in result.untried, "the search ended before it had tested whether every effect is needed"),
+        (result.verdict == "effect", "the named cause is more likely wrong than right"),
+        (True, "several causes explain the model's error about equally well"),
+    )[0]
     not_yet = f"Do not use the estimates yet, because {why}."
     return {
         "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
@@ -124,7 +128,11 @@ def _lead(result: DiagnosisResult) -> str:
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
         "effect": f"Use the model with {names}{beyond}. {probable} {gap}",
-    }[result.verdict]
+    }["confusable" if _is_provisional(result) else result.verdict]
+
+
+def _is_provisional(result: DiagnosisResult) -> bool:
+    return is_provisional(result.verdict, result.probability, result.untried)
 
 
 def _rivals(result: DiagnosisResult) -> list[list[str]]:
@@ -336,4 +344,5 @@ def _remains(result: DiagnosisResult) -> list[str]:
         least = max(own["std"], _MIN_RELATIVE_CHANGE * abs(own["before"]), 1e-9)
         changes.append((abs(own["after"] - own["before"]) / least, text))
     moved = listed([text for change, text in sorted(changes, key=lambda own: -own[0]) if change > 1], _MAX_NAMED)
+    moved *= not _is_provisional(result)
     return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]
