@@ -272,7 +272,7 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = f"no tried effect has a size above {limits.min_z:g} times its ± and explains enough of the error"
+    tried = f"no tried effect both has a size above {limits.min_z:g} times its ± and explains enough of the error"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)

@@ -138,7 +138,8 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
         yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
-        yield f"Before you use values, also follow the advice below on these issues: {mild}."
+        do = "Also" if result.get("verdict") == "unknown" else "Before you use values, also"
+        yield f"{do} follow the advice below on these issues: {mild}."
     yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 
