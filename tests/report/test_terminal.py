@@ -108,7 +108,7 @@ def test_a_solve_says_what_is_not_found():
     assert ("Fix a at a known value" in said, "a (motion too weak). `yid-ocp" in said) == (True, True)
     more = [issue | {"where": place, "setting": f"parameters.{place}.free: false"} for place in "bcd"]
     many = told("yid-solve/1", solved(parameters=both, issues=[issue, *more]))
-    assert ("Issues:" in lines, "Issues:" in many, "warning, b, c, d (warning): " in " ".join(many)) == (
+    assert ("Issues:" in lines, "Issues:" in many, "warning, b, c, d (error: warning): " in " ".join(many)) == (
         False,
         True,
         True,
@@ -134,7 +134,8 @@ def test_a_solve_says_what_is_not_found():
 def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     said = solved(fit=BAD, parameters={"a": parameter("not_trusted")})
     first = "Do not use the values yet, because the model does not explain the recordings (chi2 per degree of freedom "
-    first += "is 41.7; noise alone gives 1). To find the cause, check the stated noise and run `yid-ocp diagnose`."
+    first += "is 41.7; noise alone gives 1). To find the cause, check the stated noise (is it 6.5 times as "
+    first += "large?) and run `yid-ocp diagnose`."
     lines = told("yid-solve/1", said)
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     sure = "Until then, take these values as rough: a. Their ± includes the error of the model."

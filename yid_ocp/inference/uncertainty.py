@@ -498,9 +498,9 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    checks = "check the stated noise and " if fraction == 1 else ""
-    if chi2_per_dof * fraction**2 > HOPELESS_CHI2:
-        checks = "check units, signs, names and noise and "
+    checks = "check units, signs, names and noise and "
+    if chi2_per_dof * fraction**2 <= HOPELESS_CHI2:
+        checks = f"check the stated noise (is it {chi2_per_dof**0.5:.2g} times as large?) and " * (fraction == 1)
     return f"{said} To find the cause, {checks}run `yid-ocp diagnose`." if with_advice else said
 
 
