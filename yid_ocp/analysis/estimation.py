@@ -362,9 +362,7 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             best = min(rms, key=rms.__getitem__, default="")
             guess, unit = rms.get(best, np.inf), units[channels[0]]
             if error > _WORSE_RATIO * guess:
-                what = (
-                    f"the rms error of the model is {error:.3g} {unit}, but the guess '{BASELINE_DESCRIPTIONS[best]}' "
-                )
+                what = f"the model's rms error is {error:.3g} {unit}, but the guess '{BASELINE_DESCRIPTIONS[best]}' "
                 what += f"has {guess:.3g} {unit} ({_WORSE_RATIO:g} times this is tolerated)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
