@@ -42,16 +42,18 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         wider = f"Record a motion in which {aspects[0]}{at} varies over a wider range."
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
-    still = {*_IMMOVABLE_LOCATIONS, *(channel.rpartition(".")[0] for channel in result.noise_floor)}  # also sensors
+    sensors = {"camera", *(channel.rpartition(".")[0] for channel in result.noise_floor)}
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
-    movable = ", ".join([name for name in first if name not in still])
+    movable = ", ".join([name for name in first if name not in sensors.union(_IMMOVABLE_LOCATIONS)])
+    faulty = ", ".join([name for name in first if name in sensors])
+    check = f"Check stated noise, setup and clock of {faulty}. Faster and larger motions show more effects."
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
     larger = "Record faster and larger motions, which show more effects."
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
         "insufficient_data": "Raise problem.duration if it is set, record longer motions, or free fewer parameters.",
-        "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (True, larger))[0],
+        "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (faulty, check), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
@@ -279,7 +281,7 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     more = f"Only these kinds could be tried: {', '.join(kinds)}. If diagnosis.candidates limits them, set it to all."
     more *= len(kinds) <= _FEW_KINDS
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
-    unlike = f"the error resembles no tried effect (no p-value is below {limits.significance_level:g})"
+    unlike = f"the error resembles no tried effect (the p-value of each is above {limits.significance_level:g})"
     failed = "every refit with an effect failed"
     alike = any(score.p_value < limits.significance_level for score in result.screening.candidate_scores)
     causes = (not alike, unlike), (result.untried, stopped), (True, failed)

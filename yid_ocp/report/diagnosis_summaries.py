@@ -344,13 +344,13 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdicts = {own["verdict"] for own in free.values()}
     rows = rows if verdicts - {"not_identifiable"} or beside else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
-    yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
+    yield SummaryTable([*_effort_rows(others | methods)], "Fit and computing time of each method")
     for name, entry in known.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
         else:
             yield from (f"{name} {sentence}." for sentence in entry["disagreements"])
-    steps = {"estimate with a report": "solve"} if verdicts & {"identifiable", "weak"} else {}
+    steps = {"estimate by one method, in more detail": "solve"} if verdicts & {"identifiable", "weak"} else {}
     if verdicts & {"weak", "not_identifiable"}:
         steps["rank experiments that determine more (takes minutes)"] = "identifiability --what-if"
     yield next_steps_table(result, steps)
