@@ -198,10 +198,7 @@ def _explained_fraction(nominal: RefitStatistics, last: RefitStatistics, limits:
 def _check_effect_amplitude_transfer(
     search: RefitContext, fit: RefitStatistics
 ) -> tuple[EffectAmplitudeTransferCheck, ...]:
-    """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
-
-    Empty if one recording is split, or if the refit fails; neither is evidence against an effect.
-    """
+    """Compare amplitudes with those of a held-out refit; empty without one, which is no evidence against an effect."""
     if (again := search.refit_on_held_out(fit)) is None:
         return ()
     names = ((effect, name) for effect in fit.effects for name in effect.amplitude_parameter_names)
