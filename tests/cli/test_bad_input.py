@@ -147,7 +147,9 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
         "solve", repository / "configs" / "single_arm_no_vision.yaml",
         "--set", "model.object={kind: foam_y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
     )  # fmt: skip
-    assert_refused(done, "grasp 'left' cannot be closed", "mm apart", "model.grasp.left")
+    assert_refused(done, "grasp 'left' are at least", "mm apart", "model.grasp.left")
+    done = cli("check", repository / "configs/single_arm_vision.yaml", "--set", "model.arms.joints=[left_s0, left_s1]")
+    assert_refused(done, "mm apart", "model.arms.joints", "add these recorded joints, which the model fixes: left_e0")
     left_nothing()
 
 

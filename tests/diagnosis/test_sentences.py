@@ -46,7 +46,7 @@ from yid_ocp.diagnosis.baseline import (
 from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import HeldOutTruncation
 from yid_ocp.diagnosis.sentences import diagnosis_summary_text, next_step_texts, recommended_experiment_text
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.thresholds import NEED_TEST, Thresholds
 from yid_ocp.effects import EFFECTS, EffectBase
 from yid_ocp.effects.friction import EFFECT_KINDS_BY_FRICTION_LAW
 
@@ -165,6 +165,8 @@ def unknown():
         "stopped with an effect",
         with_effect(FRICTION, 0.5, **hurried | {"untried": ("further effects beside a@x",)}),
     )
+    yield "need not tested", with_effect(FRICTION, 0.5, **hurried | {"untried": (NEED_TEST,)})
+    yield "improbable", finding(**absorbing(FRICTION, **{"T1.bend": (1.0, 9.0)}), probability=0.49)
     rivals = {"selected_effects": (added(FRICTION, [OFFSET, joints[1]]),), "untried": (OFFSET.label,)}
     yield "stopped beside a probable cause", finding("confusable", **hurried | rivals)
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}

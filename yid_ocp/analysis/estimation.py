@@ -138,10 +138,7 @@ def uncounted_error_texts(problem: EstimationProblem, counted: Collection[str]) 
 def _checked_solution_and_issues(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """Return the solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit.
-
-    The residuals of a fit that did not converge tell nothing about the recordings.
-    """
+    """Return the solution (`not_trusted` if issues are serious) and the issues of the data and of a converged fit."""
     if solution.evaluation is None or solution.status != Status.CONVERGED:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_units_and_fit_rmse(problem, solution, held_out)
@@ -362,8 +359,8 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             best = min(rms, key=rms.__getitem__, default="")
             guess, unit = rms.get(best, np.inf), units[channels[0]]
             if error > _WORSE_RATIO * guess:
-                what = f"the rms error of the model is {error:.3g} {unit}, but that of the guess "
-                what += f"'{BASELINE_DESCRIPTIONS[best]}' is {guess:.3g} {unit} ({_WORSE_RATIO:g} times is tolerated)"
+                what = f"the model's rms error is {error:.3g} {unit}, but the guess '{BASELINE_DESCRIPTIONS[best]}' "
+                what += f"has {guess:.3g} {unit} ({_WORSE_RATIO:g} times this is tolerated)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])

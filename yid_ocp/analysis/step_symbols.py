@@ -279,10 +279,10 @@ def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[_SymbolBl
     """Return the index of a row or column by its full name. Raises `ConfigError`, with the nearest name, if unknown."""
     if name in known:
         return known.index(name)
-    shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]
+    shapes = [f"{b.full_names[0]} ({b.meaning})" for b in blocks if b.labels]
     # of the same block, if the block exists
     same = tuple(n for b in blocks if b.name == name.partition("[")[0] for n in b.full_names)
     hint = nearest_name_question(name, known if len(known) < 12 else same or known)
-    hint = hint or "see all names in equations.txt of `yid-ocp inspect`"
+    hint = hint or "leave --entry out: equations.txt of `yid-ocp inspect` has all names"
     allowed = f"{kind}s such as {', '.join(shapes)}"
     raise ConfigError(f"the equations of a step have no {kind} '{name}'", where="--entry", allowed=allowed, hint=hint)

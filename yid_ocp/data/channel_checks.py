@@ -227,8 +227,8 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             again = np.sum(steps == 1) >= least / 2 and np.any(steps > 1)
             if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
-                what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                what += f" (fewer than {least} such samples are tolerated)"
+                what = f"{channel} is cut off (saturated) at {sign * levels[-1]:.4g} N m: {at.sum()} samples have "
+                what += f"exactly this value (fewer than {least} are tolerated)"
                 advice = "if the sensor measures torque, record within its range or cut out these times. "
                 advice += "If the efforts are a controller's commands, state this"
                 line, place = f"sensors.{JOINT_EFFORT_SENSOR_KEY}.effort_sampling_kind: command", (group, channel)

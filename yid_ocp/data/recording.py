@@ -538,8 +538,8 @@ def _check_pose(pose: Array, where: str) -> None:
 def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one name for every column, each once"
     raise_data_error_unless(group.names, "the group has no names", where, allowed, "write them into its entry `names`")
-    allowed, hint = "one sample or more", "leave the group out, or import data with samples"
-    raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
+    allowed, hint = "one sample or more", "import the data again, with samples of this group or without it"
+    raise_data_error_unless(group.t.size > 0, f"the group '{group.name}' has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
         usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
         what, allowed = f"the name {name!r} cannot be used", "a text that is not empty and has no control characters"

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import EffectsWithStart, RefitContext, RefitStatistics, refit_with_each_effect
 from yid_ocp.diagnosis.screening import ScreeningResult
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.thresholds import NEED_TEST, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference import null_test
 
@@ -105,10 +105,7 @@ def _chi2(fit: RefitStatistics) -> float:
 
 
 def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """Held-out loss beyond that of the best model, and the mean logarithm of blocks' ratios, in standard errors.
-
-    The larger of both counts, because a few large blocks dominate the error of the sum.
-    """
+    """The larger of held-out loss beyond the best model's and mean logarithm of blocks' ratios, in standard errors."""
     loss, best = fit.held_out_loss, other.held_out_loss
     lost, error = null_test.chi2_per_sample_decrease_and_std_error(loss, best)
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
@@ -117,10 +114,7 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
-
-    Beside other effects, they must also explain a good part of what is left. Less may be errors of the others.
-    """
+    """Whether the effects that `without` lacks are significant and predict clearly better, beside others far better."""
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = null_test.chi2_per_sample_decrease_and_std_error(before, after)
     part_of_fitted = 2 * (without.cost - fit.cost) / max(without.excess_chi2, 1.0)
@@ -233,14 +227,11 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
 def _reconsidered(
     search: RefitContext, nominal: RefitStatistics, fit: RefitStatistics, before: RefitStatistics, rivals: _Rivals
 ) -> RefitStatistics:
-    """Try each effect's position again with all others present: without it, and with other effects instead.
-
-    The position beside the effects of `before`, the fit without the last addition, has just been tried.
-    """
+    """Try each effect's position, unless just tried (`before`), again: without it, and with other effects instead."""
     tried = {frozenset[str](), frozenset(effect.label for effect in before.effects)}
     labels = frozenset(effect.label for effect in fit.effects)
     while own := next((effect for effect in fit.effects if labels - {effect.label} not in tried), None):
-        if search.is_skipped_past_deadline("whether every effect is needed"):
+        if search.is_skipped_past_deadline(NEED_TEST):
             break
         tried.add(labels - {own.label})
         fit = _revised(search, nominal, fit, own, rivals)
@@ -292,10 +283,7 @@ def _equivalents_and_shares(
 
 
 def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:
-    """Root mean square change of each effect parameter of a fit by one plausible effect more; empty if none can act.
-
-    Any further effect may have a part in the gap that the fit leaves. A fit that leaves only noise has no gap.
-    """
+    """Root mean square change of each effect parameter by one plausible effect more; empty if only noise is left."""
     if _leaves_noise(fit, limits):
         return {}
     # one effect more, and no other one less

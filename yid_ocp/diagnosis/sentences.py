@@ -8,7 +8,7 @@ import numpy as np
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.refit import RefitStatistics, RefittedModel
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.thresholds import NEED_TEST, Thresholds, is_provisional
 from yid_ocp.display import abbreviated_names_text as listed
 from yid_ocp.display import count_with_noun, p_value_text, unseen_effects_sentence
 from yid_ocp.display import texts_that_hold as _said
@@ -42,16 +42,18 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         wider = f"Record a motion in which {aspects[0]}{at} varies over a wider range."
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
-    still = {*_IMMOVABLE_LOCATIONS, *(channel.rpartition(".")[0] for channel in result.noise_floor)}  # also sensors
+    sensors = {"camera", *(channel.rpartition(".")[0] for channel in result.noise_floor)}
     first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
-    movable = ", ".join([name for name in first if name not in still])
+    movable = ", ".join([name for name in first if name not in sensors.union(_IMMOVABLE_LOCATIONS)])
+    faulty = ", ".join([name for name in first if name in sensors])
+    check = f"Check stated noise, setup and clock of {faulty}. Faster and larger motions show more effects."
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
     larger = "Check the stated noise. If it is right, record faster and larger motions, which show more effects."
     changed = "Find out what changed the parameters since the earlier runs."
     enough = "Nothing is needed for motions like these. Other motions may still show a gap."
     texts = {
         "insufficient_data": "Raise problem.duration if it is set, record longer motions, or free fewer parameters.",
-        "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (True, larger))[0],
+        "unknown": _said((result.untried, _LONGER_SEARCH), (movable, most), (faulty, check), (True, larger))[0],
         "no_gap": _said((_changed(result), changed), (True, enough))[0],
         "confusable": "Record faster motions and other postures, to separate the effects from changed parameters.",
         "effect": "Record and diagnose other motions. The parameters of a right cause keep their values within ±.",
@@ -115,8 +117,12 @@ def _lead(result: DiagnosisResult) -> str:
     use = _said((_changed(result), "Parameters have changed since the earlier runs."), (True, use))[0]
     none = f"{use} There is no relevant gap: {sizes} ({chance}). The recordings {shown}."
     untested = {*result.untried}.intersection(*_rivals(result)[:1])
-    equal = "several causes explain the model's error about equally well"
-    why = _said((untested, "the search ended before it had tested every probable cause"), (True, equal))[0]
+    why = _said(
+        (untested, "the search ended before it had tested every probable cause"),
+        (NEED_TEST in result.untried, "the search ended before it had tested whether every effect is needed"),
+        (result.verdict == "effect", "the named cause is more likely wrong than right"),
+        (True, "several causes explain the model's error about equally well"),
+    )[0]
     not_yet = f"Do not use the estimates yet, because {why}."
     return {
         "insufficient_data": f"The model is not tested: the recordings have {few}, and {shown} (at least 1 is needed).",
@@ -124,7 +130,7 @@ def _lead(result: DiagnosisResult) -> str:
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
         "effect": f"Use the model with {names}{beyond}. {probable} {gap}",
-    }[result.verdict]
+    }["confusable" if is_provisional(result.verdict, result.probability, result.untried) else result.verdict]
 
 
 def _rivals(result: DiagnosisResult) -> list[list[str]]:
@@ -264,14 +270,14 @@ def _reason(result: DiagnosisResult) -> tuple[str, str]:
     few = f"{100 * fitted:.3g} % of the error on fitted motions (needed: {100 * least:.3g} %)"
     end = f" and {100 * closed:.3g} % on held-out ones (lower end of the interval; needed: {100 * goal:.3g} %)"
     stopped = "the time limit ended the search before the model was refitted with any effect"
-    tried = f"no tried effect has a size above {limits.min_z:g} times its ± and explains enough of the error"
+    tried = f"no tried effect both has a size above {limits.min_z:g} times its ± and explains enough of the error"
     apart = "".join(f". By noise alone, {text}" for texts in sizes.values() for text in texts[:2])
     limit = f"with the remaining error in its ±, it is below {limits.min_z:g} times this ±"
     kinds = dict.fromkeys(score.effect.kind for score in result.screening.candidate_scores)
     more = f"Only these kinds could be tried: {', '.join(kinds)}. If diagnosis.candidates limits them, set it to all."
     more *= len(kinds) <= _FEW_KINDS
     again = f"If {unsure} changed between the recordings, diagnose them separately. Otherwise another cause acts."
-    unlike = f"the error resembles no tried effect (no p-value is below {limits.significance_level:g})"
+    unlike = f"the error resembles no tried effect (the p-value of each is above {limits.significance_level:g})"
     failed = "every refit with an effect failed"
     alike = any(score.p_value < limits.significance_level for score in result.screening.candidate_scores)
     causes = (not alike, unlike), (result.untried, stopped), (True, failed)
@@ -336,4 +342,5 @@ def _remains(result: DiagnosisResult) -> list[str]:
         least = max(own["std"], _MIN_RELATIVE_CHANGE * abs(own["before"]), 1e-9)
         changes.append((abs(own["after"] - own["before"]) / least, text))
     moved = listed([text for change, text in sorted(changes, key=lambda own: -own[0]) if change > 1], _MAX_NAMED)
+    moved *= not is_provisional(result.verdict, result.probability, result.untried)
     return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -11,6 +12,14 @@ from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.smoother import DEFAULT_MIN_LOG_BAYES_FACTOR
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.options import ExcessResidualCriteria
+
+NEED_TEST = "whether every effect is needed"  # the name of the last test of a search, which a time limit can skip
+_MIN_FINAL_PROBABILITY = 0.5  # of the accepted effects, below which they are provisional
+
+
+def is_provisional(verdict: str, probability: float, untried: Sequence[str]) -> bool:
+    """Check whether accepted effects are probably not the cause, or the need for each of them was not tested."""
+    return verdict == "effect" and (probability < _MIN_FINAL_PROBABILITY or NEED_TEST in untried)
 
 
 @dataclass(frozen=True)

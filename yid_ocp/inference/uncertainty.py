@@ -313,10 +313,7 @@ def _std_from_covariance(covariance: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Return the covariance data of result.json: `matrix` (n, n), a covariance, rescaled to the deviations `std` (n,).
-
-    Parameters whose standard deviation is not finite and positive are left out.
-    """
+    """Return the `matrix` of result.json rescaled to the deviations `std`, without those that are infinite or zero."""
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
     return {"names": [names[i] for i in at], "matrix": (matrix[np.ix_(at, at)] * np.outer(factor, factor)).tolist()}
@@ -498,9 +495,9 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    checks = "check the stated noise and " if fraction == 1 else ""
-    if chi2_per_dof * fraction**2 > HOPELESS_CHI2:
-        checks = "check units, signs, names and noise and "
+    checks = "check units, signs, names and noise and "
+    if chi2_per_dof * fraction**2 <= HOPELESS_CHI2:
+        checks = f"check the stated noise (is it {chi2_per_dof**0.5:.2g} times as large?) and " * (fraction == 1)
     return f"{said} To find the cause, {checks}run `yid-ocp diagnose`." if with_advice else said
 
 
@@ -517,10 +514,7 @@ def value_and_uncertainty_text(
     least_digits: int = 4,
     verdict: str | None = None,
 ) -> str:
-    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std.
-
-    A value with the verdict `not_identifiable` has no meaning and is shown as a dash.
-    """
+    """Format a value with its 95 % interval, or with its std to two digits; a dash if it is not identifiable."""
     if verdict == "not_identifiable":
         return "–"
     if interval is not None and interval != (None, None):

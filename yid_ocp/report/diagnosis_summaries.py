@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.estimation import channel_or_group_unit
+from yid_ocp.diagnosis.thresholds import is_provisional
 from yid_ocp.display import (
     abbreviated_names_text,
     count_with_noun,
@@ -55,11 +56,12 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdict = result["verdict"].replace("_", " ")
     gap, *others = result["summary"].split("\n")
     is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
-    head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe
+    is_open = is_provisional(verdict, result.get("probability", 1.0), result.get("untried", ()))
+    head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe + " (provisional)" * is_open
     kinds = dict.fromkeys(own["kind"] for own in result.get("effects", ()) if own["kind"] in EFFECTS)
     meant = " ".join(f"{kind}: {(EFFECTS[kind].__doc__ or '').partition(chr(10))[0]}" for kind in kinds)
     yield from issue_summary_blocks(result) if is_severe else ()
-    parts = f"{head}: {verdict}. {gap}", *others, unused_efforts_sentence(result), meant
+    parts = f"{head}: {verdict}. {gap}", *others, unused_efforts_sentence(result), meant * (not is_open)
     yield from (SummaryStatement(part, "verdict") for part in parts)
     yield from () if is_severe else issue_summary_blocks(result)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
@@ -77,7 +79,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
         rows.append((own["channel"], own["recording"], *times, peak, own["unit"], impulse, f"{own['unit']} s"))
     yield SummaryTable(rows, "Pushes and wrong samples", is_page_only=True)
-    fitted = _candidate_rows(result)
+    fitted = _candidate_rows(result, is_open)
     yield SummaryTable(fitted, "Effects that were fitted, and the part of the held-out error beyond noise each removes")
     possible = "Possible: not accepted yet, because another cause may explain the error as well."
     yield possible if any("possible" in row for row in fitted) else ""
@@ -100,7 +102,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield SummaryTable(rows, "Errors (rms) on recordings made without and with the effects")
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
-    yield from copyable_estimates_blocks(result)
+    yield from () if is_open else copyable_estimates_blocks(result)
     to_do = result.get("next_steps", ())
     yield SummaryStatement(f"Do next: {to_do[0]}" if len(to_do) == 1 else "Do next:" * bool(to_do), "verdict")
     yield from (SummaryStatement(f"{i}. {step}", "verdict") for i, step in enumerate(to_do, 1) if to_do[1:])
@@ -113,10 +115,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         yield CodeBlock(shlex.join(["yid-ocp", "plan", str(file), *settings]))
 
 
-def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
+def _candidate_rows(result: Mapping[str, Any], is_open: bool) -> TableRows:
     """Return table rows of the candidates that were fitted or are possible causes."""
     rows: TableRows = [("effect", "parameters", "removed error", "p-value of forecast", "verdict")]
-    chosen = "accepted" if result["verdict"] == "effect" else "possible"
+    chosen = "accepted" if result["verdict"] == "effect" and not is_open else "possible"
     verdicts = {effect_entry_label(own): "possible" for alike in result.get("confusable", ()) for own in alike}
     added = {effect_entry_label(own): chosen for own in result.get("effects", ())}
     verdicts |= added
@@ -135,7 +137,7 @@ def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
             percent = f"{100 * abs(entry['closure']):.3g} %"
             rows.append((label, ", ".join(values), "adds " * (entry["closure"] < 0) + percent, *ends))
         elif label in verdicts:
-            how = "fitted beside others only" if label in added else "not fitted (values: forecast)"
+            how = "fitted beside others only" if label in added else "not fitted alone (values: forecast)"
             rows.append((label, ", ".join(values), how, *ends))
     return rows
 
@@ -341,13 +343,13 @@ def _compare_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     verdicts = {own["verdict"] for own in free.values()}
     rows = rows if verdicts - {"not_identifiable"} or beside else []
     yield SummaryTable(rows, "Estimates by each method (± is one standard deviation)", is_key_table=True)
-    yield SummaryTable([*_effort_rows(methods)], "Fit and computing time of each method")
+    yield SummaryTable([*_effort_rows(others | methods)], "Fit and computing time of each method")
     for name, entry in known.items():
         if entry["status"] != "converged":  # the message names the key of `solve`
             yield f"{name} did not converge: {entry['message'].replace('solver.', f'compare.methods.{name}.')}."
         else:
             yield from (f"{name} {sentence}." for sentence in entry["disagreements"])
-    steps = {"estimate with a report": "solve"} if verdicts & {"identifiable", "weak"} else {}
+    steps = {"estimate by one method, in more detail": "solve"} if verdicts & {"identifiable", "weak"} else {}
     if verdicts & {"weak", "not_identifiable"}:
         steps["rank experiments that determine more (takes minutes)"] = "identifiability --what-if"
     yield next_steps_table(result, steps)

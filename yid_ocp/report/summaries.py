@@ -557,7 +557,8 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
     yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
     option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
-    yield next_steps_table(result, {"estimate parameters": f"solve --set {option} --set 'recordings.held_out=[]'"})
+    step = f"solve --set {option} --set 'recordings.held_out=[]'"
+    yield next_steps_table(result, {"estimate parameters by the same model": step})
 
 
 @SUMMARIES.register("yid-track/1")

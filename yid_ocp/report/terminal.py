@@ -133,12 +133,13 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         options = [*advised_options((first, *others)).values()]
         do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if options else ".")
         example = " at the first place," * any(own["what"] != first["what"] for own in others)
-        text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
+        text = f"{where} (error: {first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
         advice += [text, CodeBlock("\n".join(options))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
-        yield SummaryStatement(f"Use no value of a fit until this is corrected: {severe}.", "verdict")
+        yield SummaryStatement(f"Use no value of a fit yet, because of these issues: {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
-        yield f"Before you use values, also follow the advice below on these issues: {mild}."
+        do = "Also" if result.get("verdict") == "unknown" else "Before you use values, also"
+        yield f"{do} follow the advice below on these issues: {mild}."
     yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 
@@ -177,10 +178,7 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
 
 
 def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield statements on a poor fit: start values to check, except of joints that hardly move, and rough values.
-
-    A value is rough but meaningful if its standard deviation, misfit included, is at most 10 % of it.
-    """
+    """Yield statements on a poor fit: start values of moving joints to check, and values with a ± of at most 10 %."""
     fit = result["fit"]
     if fit["explains"]:
         return

@@ -54,11 +54,12 @@ def _points(
     frames = {p: choice.frame_by_recorded_name.get(p, p) for p in wanted}
     mechanism = around.system.mechanism
     known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
-    key = f"sensors.{group.name}.used_points (`simulate` writes the points of this list only)"
     if lost := [point for point in wanted if point not in group.names]:
-        what, unused = f"the recording has no point '{lost[0]}'", [name for name in group.names if name not in wanted]
-        hint = nearest_name_question(lost[0], unused) or f"add it to the recording, or remove it from {key}"
-        raise DataError(what, where=where, allowed=", ".join(group.names), hint=hint)
+        what = f"recording '{around.recording.name}' has no point '{lost[0]}'"
+        unused = [name for name in group.names if name not in wanted]
+        hint = nearest_name_question(lost[0], unused) or "remove it from this list."
+        hint += " `simulate` writes the points of its own list only"
+        raise DataError(what, where=f"sensors.{group.name}.used_points", allowed=", ".join(group.names), hint=hint)
     for point in wanted:
         # points listed by name are used
         if point not in known and (choice.used_points is not None or point in choice.frame_by_recorded_name):

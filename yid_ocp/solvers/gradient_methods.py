@@ -274,7 +274,7 @@ class SteepestDescent(base.SolverWithCheckedSettings):
             slope = max_abs_projected_gradient(x, gradient, lower, upper, size)
             recorder.record_iterate(cost, x, slope)
             if len(recorder.history) > self.max_iterations:
-                limit = f"the search reached its limit of {self.max_iterations} iterations (solver.max_iterations)"
+                limit = f"a start reached its limit of {self.max_iterations} iterations (solver.max_iterations)"
                 return ended(base.Status.ITERATION_LIMIT, f"{limit}, as is usual for this method. Use gauss_newton")
             reference = max(entry.cost for entry in recorder.history[-self.nonmonotone_memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):

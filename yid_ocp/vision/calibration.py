@@ -277,8 +277,9 @@ class _Calibrator:
     def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
-            needed = f"the arm is in view in {len(glimpses)} of {len(frames)} usable frames ({_MIN_FRAMES} are needed)"
-            raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
+            needed = f"the arm is in view in {len(glimpses)} of {len(frames)} frames ({_MIN_FRAMES} are needed)"
+            turn = "turn the camera so that it sees the arm, or " * (len(glimpses) < len(frames))
+            raise _UntoldError(needed, f"{turn}record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state = self._rounds(state, chosen, _STAGE_REACHES[-1], True, _STAGE_POINTS, _STAGE_ITERATIONS)[0]

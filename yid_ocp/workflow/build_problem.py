@@ -57,10 +57,7 @@ _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia
 
 
 def make_problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """Make the options of the estimation problem that a run's settings describe.
-
-    Values that differ between recordings (edges of a cable, marker positions) come from `recordings`.
-    """
+    """Make the options of the estimation problem from a run's settings and, for values that differ, its recordings."""
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
     where, wanted = ("problem", "initial_state_fit_parameters"), run.problem.initial_state_fit_parameters
@@ -203,10 +200,14 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in min_grasp_gaps_at_start(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
-                where, allowed = run.setting_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
-                what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
-                what = f"{what}: its two frames remain {1e3 * gap:.3g} mm apart"
-                raise DataError(what, where=where, allowed=allowed, hint=hint)
+                what = f"at the first posture of '{episode.name}', the two frames of grasp '{name}' are at least "
+                what = f"{what}{1e3 * gap:.3g} mm apart"
+                at, allowed = ("grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
+                known = problem.system.mechanism.joint_names
+                if still := [joint for joint in episode.recording.joint_names if joint not in known]:
+                    at = ("arms", "joints")
+                    hint = f"add these recorded joints, which the model fixes: {', '.join(still)}"
+                raise DataError(what, where=run.setting_location("model", *at), allowed=allowed, hint=hint)
 
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:

@@ -228,7 +228,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         found["links"] = rows = [_row(count, own), _row(2 * count, finer)]
         links = f"the number of links goes from {count} to {2 * count}"
         per_joint = [name for name in values if link_division_parameter_scale(run, name, 2) != 1]
-        double = f" and double the initial values per joint ({abbreviated_names_text(per_joint)})" * bool(per_joint)
+        double = f" and double the initial values of {abbreviated_names_text(per_joint)}, as each segment is then half "
+        double = f"{double}as long" * bool(per_joint)
         _warn(found, "the links are", links, f"{abbreviated_names_text(item.divided_links_settings)}{double}", rows)
     return found
 

@@ -16,7 +16,7 @@ from yid_ocp.data.checks import recording_quality_issues
 from yid_ocp.data.merge import merge_recordings
 from yid_ocp.data.readers import base, preview_file, read_any, reader_option_names_for_file
 from yid_ocp.data.readers.csv import column_pattern
-from yid_ocp.display import Progress
+from yid_ocp.display import Progress, grouped
 from yid_ocp.errors import ConfigError, DataError, unknown_name_error_arguments
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.options import class_options_by_key, mapping_value_type
@@ -127,9 +127,10 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[l
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
     kinds = {"warning": "warning", "not_trusted": "issue", "refused": "issue"}
     said = []
-    for own in found:
-        setting = f" (in CONFIG.yaml: {own.setting})" if own.setting else ""
-        said.append(f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n  try: {own.advice}{setting}")
+    cures = ((own.advice + f" (in CONFIG.yaml: {own.setting})" * bool(own.setting), own) for own in found)
+    for cure, alike in grouped(cures).items():
+        told = (f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n" for own in alike)
+        said.append(f"{''.join(told)}  try: {cure}")
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
         said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
     is_severe = bool(units) or any(own.severity != "warning" for own in found)
