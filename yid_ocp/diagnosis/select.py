@@ -105,7 +105,10 @@ def _chi2(fit: RefitStatistics) -> float:
 
 
 def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> float:
-    """The larger of held-out loss beyond the best model's and mean logarithm of blocks' ratios, in standard errors."""
+    """Held-out loss beyond that of the best model, and the mean logarithm of blocks' ratios, in standard errors.
+
+    The larger of both counts, because a few large blocks dominate the error of the sum.
+    """
     loss, best = fit.held_out_loss, other.held_out_loss
     lost, error = null_test.chi2_per_sample_decrease_and_std_error(loss, best)
     ratios = np.log(np.clip(loss.block_chi2, 1.0, 1e300) / np.maximum(best.block_chi2, 1.0))
@@ -114,7 +117,10 @@ def _distance_in_prediction(fit: RefitStatistics, other: RefitStatistics) -> flo
 
 
 def _is_needed(without: RefitStatistics, fit: RefitStatistics, limits: Thresholds) -> bool:
-    """Whether the effects that `without` lacks are significant and predict clearly better, beside others far better."""
+    """Whether the effects that `without` lacks are significant, and held-out recordings predicted clearly better.
+
+    Beside other effects, they must also explain a good part of what is left. Less may be errors of the others.
+    """
     before, after = without.held_out_loss, fit.held_out_loss
     gained, error = null_test.chi2_per_sample_decrease_and_std_error(before, after)
     part_of_fitted = 2 * (without.cost - fit.cost) / max(without.excess_chi2, 1.0)
@@ -227,7 +233,10 @@ def _pairs_to_refit(search: RefitContext, screened: ScreeningResult, without: Ef
 def _reconsidered(
     search: RefitContext, nominal: RefitStatistics, fit: RefitStatistics, before: RefitStatistics, rivals: _Rivals
 ) -> RefitStatistics:
-    """Try each effect's position, unless just tried (`before`), again: without it, and with other effects instead."""
+    """Try each effect's position again with all others present: without it, and with other effects instead.
+
+    The position beside the effects of `before`, the fit without the last addition, has just been tried.
+    """
     tried = {frozenset[str](), frozenset(effect.label for effect in before.effects)}
     labels = frozenset(effect.label for effect in fit.effects)
     while own := next((effect for effect in fit.effects if labels - {effect.label} not in tried), None):
@@ -283,7 +292,10 @@ def _equivalents_and_shares(
 
 
 def _model_error_std(fit: RefitStatistics, later: Sequence[RefitStatistics], limits: Thresholds) -> dict[str, float]:
-    """Root mean square change of each effect parameter by one plausible effect more; empty if only noise is left."""
+    """Root mean square change of each effect parameter of a fit by one plausible effect more; empty if none can act.
+
+    Any further effect may have a part in the gap that the fit leaves. A fit that leaves only noise has no gap.
+    """
     if _leaves_noise(fit, limits):
         return {}
     # one effect more, and no other one less

@@ -130,7 +130,11 @@ def _lead(result: DiagnosisResult) -> str:
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
         "effect": f"Use the model with {names}{beyond}. {probable} {gap}",
-    }["confusable" if is_provisional(result.verdict, result.probability, result.untried) else result.verdict]
+    }["confusable" if _is_provisional(result) else result.verdict]
+
+
+def _is_provisional(result: DiagnosisResult) -> bool:
+    return is_provisional(result.verdict, result.probability, result.untried)
 
 
 def _rivals(result: DiagnosisResult) -> list[list[str]]:
@@ -342,5 +346,5 @@ def _remains(result: DiagnosisResult) -> list[str]:
         least = max(own["std"], _MIN_RELATIVE_CHANGE * abs(own["before"]), 1e-9)
         changes.append((abs(own["after"] - own["before"]) / least, text))
     moved = listed([text for change, text in sorted(changes, key=lambda own: -own[0]) if change > 1], _MAX_NAMED)
-    moved *= not is_provisional(result.verdict, result.probability, result.untried)
+    moved *= not _is_provisional(result)
     return [" ".join(said), *_said((moved, f"With the effects in the model, these estimates change: {moved}."))]

@@ -313,7 +313,10 @@ def _std_from_covariance(covariance: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Return the `matrix` of result.json rescaled to the deviations `std`, without those that are infinite or zero."""
+    """Return the covariance data of result.json: `matrix` (n, n), a covariance, rescaled to the deviations `std` (n,).
+
+    Parameters whose standard deviation is not finite and positive are left out.
+    """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
     return {"names": [names[i] for i in at], "matrix": (matrix[np.ix_(at, at)] * np.outer(factor, factor)).tolist()}
@@ -514,7 +517,10 @@ def value_and_uncertainty_text(
     least_digits: int = 4,
     verdict: str | None = None,
 ) -> str:
-    """Format a value with its 95 % interval, or with its std to two digits; a dash if it is not identifiable."""
+    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std.
+
+    A value with the verdict `not_identifiable` has no meaning and is shown as a dash.
+    """
     if verdict == "not_identifiable":
         return "–"
     if interval is not None and interval != (None, None):

@@ -178,7 +178,10 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
 
 
 def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield statements on a poor fit: start values of moving joints to check, and values with a ± of at most 10 %."""
+    """Yield statements on a poor fit: start values to check, except of joints that hardly move, and rough values.
+
+    A value is rough but meaningful if its standard deviation, misfit included, is at most 10 % of it.
+    """
     fit = result["fit"]
     if fit["explains"]:
         return

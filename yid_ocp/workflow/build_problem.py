@@ -57,7 +57,10 @@ _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia
 
 
 def make_problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """Make the options of the estimation problem from a run's settings and, for values that differ, its recordings."""
+    """Make the options of the estimation problem that a run's settings describe.
+
+    Values that differ between recordings (edges of a cable, marker positions) come from `recordings`.
+    """
     parameters = system.parameters
     chosen = build.settings_by_parameter_name(run, parameters)
     where, wanted = ("problem", "initial_state_fit_parameters"), run.problem.initial_state_fit_parameters
