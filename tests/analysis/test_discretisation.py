@@ -473,6 +473,11 @@ def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder,
     shift = found.checks.discretisation_shifts["elbow.damping"].encoder_noise
     assert (abs(entry.value - 0.02) > 5 * data_std) == (abs(shift) > data_std) == moved
     assert abs(entry.value - 0.02) < 2 * entry.std
+    if moved:
+        slow = given.with_options(ProblemOptions(path_cutoff=4.0))
+        assert ["encoder_noise" in discretisation.finer_settings(own) for own in (given, slow)] == [True, False], (
+            "no motion is removed"
+        )
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
     arm = {"a": {"encoder_noise": 0.5, "std": 0.1}}
     cutoff = {"discretisation": arm, "finer_settings": {"encoder_noise": ["problem.path_cutoff: 4"]}}
     text = " ".join(told("yid-solve/1", solved(**cutoff)))
-    assert "set problem.path_cutoff: 4 (at least the highest frequency of the arm), and solve again." in text
+    assert "set problem.path_cutoff: 4, and solve again." in text
     assert "--set problem.path_cutoff=4 " in text, "the command has the value alone"
     rest = "Checked: half the time step would change no estimate by more than its ±."
     assert lines.index("it snaps") < (at := lines.index(said))

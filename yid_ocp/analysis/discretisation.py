@@ -29,6 +29,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, TorqueAndAngleErrorModel, truncate_episode
 from yid_ocp.problem.evaluation import INITIAL_STATE_UNKNOWN_PREFIX, Evaluation, ProcessNoiseWhitener
 from yid_ocp.problem.options import RefinementKind
+from yid_ocp.problem.recorded_inputs import has_motion_in_band
 from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
@@ -341,11 +342,17 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
 
 
 def finer_settings(problem: EstimationProblem) -> dict[str, list[str]]:
-    """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise."""
+    """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise.
+
+    Half the cutoff removes noise of encoders; it is no remedy where it would also remove motion.
+    """
     divided = problem.options.divided_links_model
     found = {"links": [*divided.settings]} if divided is not None else {}
     found["time_step"] = [f"problem.time_step: {problem.step.time_step / 2:g}"]
-    return found | {"encoder_noise": [f"problem.path_cutoff: {problem.options.path_cutoff / 2:g}"]}
+    cutoff, recordings = problem.options.path_cutoff, [episode.recording for episode in problem.episodes]
+    if math.isfinite(cutoff) and not has_motion_in_band(recordings, problem.system.prescribed, cutoff / 2, cutoff):
+        found["encoder_noise"] = [f"problem.path_cutoff: {cutoff / 2:g}"]
+    return found
 
 
 def parameter_shifts_at_finer_discretisation(

@@ -33,27 +33,32 @@ _SAMPLES_PER_NOISE_DEGREE = 6.0  # samples that give a robust estimate of noise 
 def select_path_cutoff(recordings: Sequence[Recording], joints: Sequence[str]) -> float:
     """Choose the lowest cutoff [Hz], from 10 Hz in octaves to rate / 5, above which angles contain only noise.
 
-    The power of the angles between a cutoff and twice this cutoff is compared with that of white noise of the angles'
-    noise level. A lower cutoff would remove motion, and predicted efforts would lack the torques for this motion.
+    A lower cutoff would remove motion, and predicted efforts would lack the torques for this motion.
     """
     groups = [own.joints for own in recordings if own.joints is not None and len(own.joints.t) > 1]
     most = min((_MAX_CUTOFF_OVER_RATE / median_sample_period(group.t) for group in groups), default=math.inf)
     cutoff, most = min(_MIN_PATH_CUTOFF, most), float(f"{most:.3g}")
-    channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
-    sizes = [noise_or_quantization_std(t, angle[:, 0]) for t, angle in channels]
-    while cutoff < most and min(sizes, default=0.0) > 0:
-        higher, p_values = ZeroPhaseLowPassFilter(min(2 * cutoff, most)), []
-        for (t, angle), std in zip(channels, sizes, strict=True):
-            impulse = std * (t == t[len(t) // 2])[:, None]
-            kept, noise = (higher(t, values) - ZeroPhaseLowPassFilter(cutoff)(t, values) for values in (angle, impulse))
-            # beside the ends, where filters amplify noise
-            end = min(round(0.5 / (cutoff * median_sample_period(t))), len(t) // 4)
-            degrees = 2 * (higher.cutoff - cutoff) * (t[-1 - end] - t[end]), len(t) / _SAMPLES_PER_NOISE_DEGREE
-            p_values.append(scipy.special.fdtrc(*degrees, np.mean(kept[end : len(t) - end] ** 2) / np.sum(noise**2)))
-        if min(p_values) > _NOISE_ONLY_LEVEL / len(p_values):
-            break
-        cutoff = higher.cutoff
+    while cutoff < most and has_motion_in_band(recordings, joints, cutoff, min(2 * cutoff, most)):
+        cutoff = min(2 * cutoff, most)
     return cutoff
+
+
+def has_motion_in_band(recordings: Sequence[Recording], joints: Sequence[str], low: float, high: float) -> bool:
+    """Check whether angles have more power between two frequencies [Hz] than white noise of their noise level."""
+    lower, higher, p_values = ZeroPhaseLowPassFilter(low), ZeroPhaseLowPassFilter(high), list[float]()
+    groups = [own.joints for own in recordings if own.joints is not None and len(own.joints.t) > 1]
+    channels = [(g.t, g.position[:, [g.names.index(name)]]) for g in groups for name in joints if name in g.names]
+    for t, angle in channels:
+        std = noise_or_quantization_std(t, angle[:, 0])
+        if not std > 0:
+            return False
+        impulse = std * (t == t[len(t) // 2])[:, None]
+        kept, noise = (higher(t, values) - lower(t, values) for values in (angle, impulse))
+        # beside the ends, where filters amplify noise
+        end = min(round(0.5 / (low * median_sample_period(t))), len(t) // 4)
+        degrees = 2 * (high - low) * (t[-1 - end] - t[end]), len(t) / _SAMPLES_PER_NOISE_DEGREE
+        p_values.append(scipy.special.fdtrc(*degrees, np.mean(kept[end : len(t) - end] ** 2) / np.sum(noise**2)))
+    return min(p_values, default=1.0) <= _NOISE_ONLY_LEVEL / max(len(p_values), 1)
 
 
 def step_mean_inputs(

@@ -232,10 +232,8 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> tuple[list[str]
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
         said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
-    has_cutoff = any(setting in cures for setting in settings.get("encoder_noise", ()))
-    remark = " (at least the highest frequency of the arm)" * has_cutoff
     if cures:
-        said.append(f"For a smaller ±, set {abbreviated_names_text(cures)}{remark}, and solve again.")
+        said.append(f"For a smaller ±, set {abbreviated_names_text(cures)}, and solve again.")
     return said, cures
 
 
