@@ -162,11 +162,10 @@ def test_what_lies_uphill_is_found_by_a_refit_from_where_its_screening_leads(kin
     step = compile_step(system, 0.01, use_compiler=False)
     nominal = EstimationProblem(step, runs[:1], ("shoulder.damping", "elbow.damping"), ProblemOptions(path_cutoff=20.0))
     composed = AllCandidatesProblem.from_problem(nominal, [make_effect(kind, place, system)], runs[1:])
-    start = fit_nominal_model(nominal, composed)
+    search = RefitContext(composed)
+    start = fit_nominal_model(nominal, search)
     [score] = screen_candidates(composed, (), start.values).candidate_scores
-    found = refit_with_effects(
-        RefitContext(composed), composed.candidate_effects, {**start.values, **score.predicted_values}
-    )
+    found = refit_with_effects(search, composed.candidate_effects, {**start.values, **score.predicted_values})
     for name, reported in found.effects[0].to_reported_parameters(found.values, found.std).items():
         assert reported.value == pytest.approx(values[name], rel=0.01 if kind == "effort_gain" else 0.05), name
     assert found.held_out_loss.chi2_per_sample < 0.01 * start.held_out_loss.chi2_per_sample
