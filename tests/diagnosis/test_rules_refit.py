@@ -83,14 +83,15 @@ class Problem:
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
-    made = SimpleNamespace(runs=[], failed=[], losses=[], known=None, status=Status.CONVERGED)
+    made = SimpleNamespace(runs=[], failed=[], losses=[], known=None, status=Status.CONVERGED, limited=[])
 
     def run(problem, x, callback, evaluate=None):
         values = problem.named_values(x)
         failed = problem.cost(values) is None
         (made.failed if failed else made.runs).append(values)
-        status = Status.FAILED if failed else made.status
+        status = Status.FAILED if failed else Status.ITERATION_LIMIT if made.limited else made.status
         usual = {"message": "done", "equilibrium_guesses": "there", "evaluation": made.known}
+        usual["history"] = [SimpleNamespace(cost=cost) for cost in (made.limited.pop(0) if made.limited else ())]
         return SimpleNamespace(x=np.asarray(x), status=status, **usual)
 
     def held_out(problem, x, evaluation, spread):
@@ -144,6 +145,15 @@ def test_a_refit_is_evaluated_where_it_ended(solved):
     solved.known = costing(3.0, 10)  # there are no filters to linearise anew
     assert refit_with_effects(RefitContext(problem), [FRICTION], START).cost == 3.0
     assert len(problem.asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("costs", "runs"), [([[8.0, 4.1]], 1), ([[8.0, 3.9], [3.9, 2.0]], 2), ([[9.0, 8.7, 8.0, 7.0, 6.0, 5.0, 4.4]], 1)]
+)
+def test_a_run_that_halves_its_cost_within_five_steps_goes_on_at_its_limit(solved, costs, runs):
+    solved.limited = costs
+    refit_with_effects(RefitContext(Problem(lambda values: 7.0)), [FRICTION], START)
+    assert len(solved.runs) == runs
 
 
 @pytest.mark.parametrize(("largest", "drawn"), [(2.0, 2.25), (1.3, 1.25), (0.7, 0.65), (0.4, 0.35), (0.26, 0.25)])

@@ -277,6 +277,9 @@ def _attempt(problem: AllCandidatesProblem, effects: Sequence[EffectBase], start
         outcome = solver.minimize_cost(own, own.pack_unknowns({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
+    while outcome.status == Status.ITERATION_LIMIT and outcome.history[-1].cost < outcome.history[-6:][0].cost / 2:
+        # from far away, the cost still falls fast at the limit
+        outcome = solver.minimize_cost(own, outcome.x, None)
     if not own.has_process_noise and outcome.evaluation is not None:
         return own, outcome, outcome.evaluation  # there are no filters to linearise
     found = _seen(problem, effects, outcome)
