@@ -342,10 +342,7 @@ def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> 
 
 
 def finer_settings(problem: EstimationProblem) -> dict[str, list[str]]:
-    """Return the settings, with keys and values, of twice the links, half the time step and less encoder noise.
-
-    Half the cutoff removes noise of encoders; it is no remedy where it would also remove motion.
-    """
+    """Return the settings of twice the links, half the time step, and less encoder noise if this removes no motion."""
     divided = problem.options.divided_links_model
     found = {"links": [*divided.settings]} if divided is not None else {}
     found["time_step"] = [f"problem.time_step: {problem.step.time_step / 2:g}"]

@@ -21,7 +21,7 @@ MIN_GAP_SHARE = 0.005  # smallest share of the gap of a location that is named
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
 _MAX_NAMED = 5  # number of named parameters, the most significant changes first, and of named events and places
 _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because more may exist
-_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that do not move by themselves
+_IMMOVABLE_LOCATIONS = {"world", "clock", "camera", "object", "base"}  # locations that do not move by themselves
 _LONGER_SEARCH = "To try the rest, remove diagnosis.budget, or raise it."
 _ORIGIN_TEXTS = {
     "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
@@ -43,9 +43,9 @@ def recommended_experiment_text(result: DiagnosisResult) -> str:
         end = f" This can separate these effects: {', '.join([effect.label for effect in rivals])}."
         rows += [(aspects[1:], apart + end), (places[1:], in_turn + end), (rivals[1:], wider + end)]
     sensors = {"camera", *(channel.rpartition(".")[0] for channel in result.noise_floor)}
-    first = [name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)]
-    movable = ", ".join([name for name in first if name not in sensors.union(_IMMOVABLE_LOCATIONS)])
-    faulty = ", ".join([name for name in first if name in sensors])
+    first = {name for place in _named_locations(result)[:1] for name in (place.location, *place.indistinguishable_from)}
+    movable = ", ".join(sorted(first - sensors - _IMMOVABLE_LOCATIONS))
+    faulty = ", ".join(sorted(first & sensors))
     check = f"Check stated noise, setup and clock of {faulty}. Faster and larger motions show more effects."
     most = f"Record slow and fast motions, with pauses, above all of {movable}."
     larger = "Check the stated noise. If it is right, record faster and larger motions, which show more effects."
@@ -100,7 +100,7 @@ def _lead(result: DiagnosisResult) -> str:
     large = f"Your model (the nominal model) has an error beyond noise (a gap): {sizes} ({chance})."
     small = f"In total the error of your model (the nominal model) is within noise: {sizes}. "
     small += f"But the error has the pattern of the effect {best} (p {p_value_text(along, '= ')})."
-    gap = large if null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria) else small
+    gap = _said((null_test.residuals_exceed_noise(tests, limits.null_test_excess_criteria), large), (True, small))[0]
     unknowns, seen = len(result.nominal_model.values), [own.is_detectable for own in result.screening.detectability]
     shown = f"would reveal {sum(seen)} of {len(seen)} effects at their largest expected size"
     few = f"{tests[0].degrees_of_freedom:.0f} independent samples (more than {unknowns}, one per unknown, are needed)"
@@ -129,8 +129,9 @@ def _lead(result: DiagnosisResult) -> str:
         "no_gap": none + uncertainty.overstated_noise_sentence(*max((t.chi2_per_dof, t.p_value) for t in tests)),
         "unknown": f"Do not use the estimates, because the cause of the model's error is unknown. {gap}",
         "confusable": f"{not_yet} {probable} {gap}",
-        "effect": f"Use the model with {names}{beyond}. {probable} {gap}",
-    }["confusable" if _is_provisional(result) else result.verdict]
+        "effect": _said((_is_provisional(result), not_yet), (True, f"Use the model with {names}{beyond}."))[0]
+        + f" {probable} {gap}",
+    }[result.verdict]
 
 
 def _is_provisional(result: DiagnosisResult) -> bool:
