@@ -190,6 +190,14 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 
+@pytest.mark.parametrize(("square", "counted"), [(1.0, 1.0), (2.0, 0.5)], ids=["noise", "more than noise"])
+def test_a_misfit_by_noise_of_encoders_that_move_the_model_is_none(square, counted, monkeypatch):
+    monkeypatch.setattr(uncertainty.null_test, "whiten_with_encoder_noise", lambda problem, x, residual: residual / 2)
+    problem = of_size(square)
+    fit = assess_goodness_of_fit(problem, problem.evaluate([1.0]), x=np.ones(1))
+    assert (fit.explains, fit.chi2_per_dof) == (True, pytest.approx(counted, rel=0.01))
+
+
 def wider_by_few(count):
     """How much wider intervals of so many independent scores are than those of very many."""
     return scipy.stats.t.ppf(0.975, count - 1) / scipy.stats.norm.ppf(0.975)

@@ -98,7 +98,7 @@ def compare_methods(
         taken = time.perf_counter() - wall
         evaluation = problem.evaluate(solution.x, derivatives=own is not problem)
         if own is not problem:  # chi2 of all methods must count the same residual
-            fit = uncertainty.assess_goodness_of_fit(problem, evaluation, limits)
+            fit = uncertainty.assess_goodness_of_fit(problem, evaluation, limits, solution.x)
             solution = replace(solution, goodness_of_fit=fit)
         runs.append(_MethodResult(solver.name, solution, evaluation.cost, own.predict_held_out(solution.x), taken))
     best = min(runs, key=lambda run: run.whitened_cost)

@@ -138,10 +138,7 @@ def uncounted_error_texts(problem: EstimationProblem, counted: Collection[str]) 
 def _checked_solution_and_issues(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """Return the solution, with verdicts `not_trusted` if there are serious issues, and all issues of data and fit.
-
-    The residuals of a fit that did not converge tell nothing about the recordings.
-    """
+    """Return the solution (`not_trusted` if issues are serious) and the issues of the data and of a converged fit."""
     if solution.evaluation is None or solution.status != Status.CONVERGED:
         return solution, problem.options.data_issues
     errors, units, _ = prediction_errors_units_and_fit_rmse(problem, solution, held_out)

@@ -161,7 +161,8 @@ def identifiability(
             covariance, inflation = covariance / inflation**2, 1.0
         else:
             own = wide if as_solved else problem_with_whitening_at(problem, given, rounds=2)
-            fit = uncertainty.assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
+            solved = evaluation if as_solved else own.evaluate(given)
+            fit = uncertainty.assess_goodness_of_fit(own, solved, limits, given)
             covariance = uncertainty.misfit_robust_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
         judged = uncertainty.parameter_estimates(wide, x, evaluation, covariance, fit)

@@ -125,6 +125,12 @@ def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Arr
     return whole / (math.sqrt(total / max(count * np.count_nonzero(used), 1)) or 1.0)
 
 
+def whiten_with_encoder_noise(problem: EstimationProblem, x: Array, residual: Array) -> Array:
+    """Whiten the residual (nr,) of a fit at `x` for the noise of encoders that move the model, too."""
+    by_path = encoder_noise_residual_covariance_factor(problem, x)
+    return whiten_with_drawn_errors(residual, by_path[:, :0], by_path)
+
+
 def encoder_noise_residual_covariance_factor(
     problem: EstimationProblem, x: Array, predicted: Callable[[EstimationProblem], Array | None] | None = None
 ) -> Array:

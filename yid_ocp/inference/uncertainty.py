@@ -101,8 +101,12 @@ def assess_goodness_of_fit(
     problem: EstimationProblem,
     evaluation: Evaluation,
     limits: ExcessResidualCriteria = null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    x: Array | None = None,
 ) -> GoodnessOfFit:
-    """Test whether a fit explains its own recordings. Residuals are in noise units for any weighting of the problem."""
+    """Test whether a fit explains its own recordings. Residuals are in noise units for any weighting of the problem.
+
+    With the unknowns `x` of the fit, a misfit by noise of encoders that move the model is none.
+    """
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
@@ -111,11 +115,14 @@ def assess_goodness_of_fit(
         for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True):
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
                 parts.append(((predicted - samples.value) / samples.std)[samples.positive_weight_mask])
-        residual = np.concatenate(parts)
+        residual, x = np.concatenate(parts), None  # encoder noise is known for rows of the cost only
     series = null_test.channels_with_residual_indices(problem)
     fitted = effective_parameter_count(problem, evaluation)
     share, is_trusted = limits.noise_fraction_of_stated_std, problem.options.has_no_data_issue_above_warning
     found = null_test.residual_chi2_null_test(series, residual / share, fitted)
+    if x is not None and null_test.residuals_exceed_noise((found,), limits):
+        residual = null_test.whiten_with_encoder_noise(problem, x, residual)
+        found = null_test.residual_chi2_null_test(series, residual / share, fitted)
     explains = not null_test.residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, is_trusted, share)
 
@@ -149,8 +156,7 @@ def null_tests_of_fit(
     by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, evaluation)[:shared])
     by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
     residual = null_test.whiten_with_drawn_errors(residual, by_parameters, by_path)
-    fitted_by_path = null_test.encoder_noise_residual_covariance_factor(problem, x)
-    fitted = null_test.whiten_with_drawn_errors(evaluation.residual, fitted_by_path[:, :0], fitted_by_path)
+    fitted = null_test.whiten_with_encoder_noise(problem, x, evaluation.residual)
     count = effective_parameter_count(problem, evaluation)
     before, held_out = (
         null_test.residual_chi2_null_test(null_test.channels_with_residual_indices(of), r, parameters, level)
@@ -313,10 +319,7 @@ def _std_from_covariance(covariance: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Return the covariance data of result.json: `matrix` (n, n), a covariance, rescaled to the deviations `std` (n,).
-
-    Parameters whose standard deviation is not finite and positive are left out.
-    """
+    """Return the `matrix` of result.json rescaled to the deviations `std`, without those that are infinite or zero."""
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
     return {"names": [names[i] for i in at], "matrix": (matrix[np.ix_(at, at)] * np.outer(factor, factor)).tolist()}
@@ -517,10 +520,7 @@ def value_and_uncertainty_text(
     least_digits: int = 4,
     verdict: str | None = None,
 ) -> str:
-    """Format a value with its 95 % interval, or with its std if known: all digits down to the second of the std.
-
-    A value with the verdict `not_identifiable` has no meaning and is shown as a dash.
-    """
+    """Format a value with its 95 % interval, or with its std to two digits; a dash if it is not identifiable."""
     if verdict == "not_identifiable":
         return "–"
     if interval is not None and interval != (None, None):

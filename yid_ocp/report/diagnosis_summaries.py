@@ -58,11 +58,10 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     is_severe = any(own["severity"] != "warning" for own in result.get("issues", ()))
     is_open = is_provisional(verdict, result.get("probability", 1.0), result.get("untried", ()))
     head = "Verdict" + " (in doubt: correct the issues above and repeat)" * is_severe + " (provisional)" * is_open
-    named = () if is_open else result.get("effects", ())
-    kinds = dict.fromkeys(own["kind"] for own in named if own["kind"] in EFFECTS)
+    kinds = dict.fromkeys(own["kind"] for own in result.get("effects", ()) if own["kind"] in EFFECTS)
     meant = " ".join(f"{kind}: {(EFFECTS[kind].__doc__ or '').partition(chr(10))[0]}" for kind in kinds)
     yield from issue_summary_blocks(result) if is_severe else ()
-    parts = f"{head}: {verdict}. {gap}", *others, unused_efforts_sentence(result), meant
+    parts = f"{head}: {verdict}. {gap}", *others, unused_efforts_sentence(result), meant * (not is_open)
     yield from (SummaryStatement(part, "verdict") for part in parts)
     yield from () if is_severe else issue_summary_blocks(result)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")

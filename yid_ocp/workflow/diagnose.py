@@ -155,10 +155,7 @@ def _final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
 
 
 def _texts_of_final_model(finding: DiagnosisResult, folder: str) -> dict[str, Any]:
-    """Return texts to copy: estimates of the final model, its effects, and its time step if it is not the stated one.
-
-    A parameter of an accepted effect also counts as found if it is only weakly determined.
-    """
+    """Return texts to copy: estimates (of accepted effects also weak ones), effects, and a changed time step."""
     fit, system = finding.final_model, finding.final_model.problem.system
     sizes, estimates = uncertainty.typical_parameter_magnitudes(fit.problem, fit.unknowns), {}
     added = [own.label for own in finding.accepted_effects]
