@@ -60,7 +60,7 @@ class MadeUp:
         self.has_process_noise = False
         values = [*self.initial_unknowns, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
-        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=())
+        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=(), prescribed=())
         self.theta = np.array(values[::-1])
         self.step = SimpleNamespace(time_step=0.1)
         self._count = len(rows(self.initial_unknowns, duration)[0]) if count is None else count
@@ -77,7 +77,9 @@ class MadeUp:
             fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
-        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_biases_treated_as_noise=False)
+        recording = SimpleNamespace(points=())
+        usual = {"grid": grid, "measurements": (group,), "has_biases_treated_as_noise": False}
+        return SimpleNamespace(name=f"run {i}", recording=recording, **usual)
 
     @property
     def positive_unknowns_mask(self) -> np.ndarray:
