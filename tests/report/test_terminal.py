@@ -138,7 +138,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     first += "large?) and run `yid-ocp diagnose`."
     lines = told("yid-solve/1", said)
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
-    sure = "Until then, take these values as rough: a. Their ± includes the error of the model."
+    sure = "Until then, take these values as rough: a. Their ± takes the model's error as random."
     assert (" ".join(lines[:3]), lines[3]) == (first, sure)
     for std, data in ((0.21, BAD), (0.1, BAD | {"data_trusted": False})):
         unsure = solved(fit=data, parameters={"a": parameter("not_trusted") | {"std": std}})

@@ -207,7 +207,7 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
         limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
         free = {name: std for name, std in stds.items() if std is not None and not is_at_bound(parameters[name])}
         rough = abbreviated_names_text([name for name, std in free.items() if std <= limit * values[name]])
-        said = f"Until then, take these values as rough: {rough}. Their ± includes the error of the model."
+        said = f"Until then, take these values as rough: {rough}. Their ± takes the model's error as random."
         yield SummaryStatement(said if rough else "", "conclusion")
 
 
