@@ -105,7 +105,7 @@ def assess_goodness_of_fit(
 ) -> GoodnessOfFit:
     """Test whether a fit explains its own recordings. Residuals are in noise units for any weighting of the problem.
 
-    With the unknowns `x` of the fit, a misfit by noise of encoders that move the model is none.
+    If the unknowns `x` of the fit are given, noise of encoders that move the model counts as noise.
     """
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)

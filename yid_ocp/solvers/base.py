@@ -408,7 +408,7 @@ class _MultiStartSearch:
 
     def solution(self, limits: ExcessResidualCriteria, verdicts: bool) -> Solution:
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
-        fit = assess_goodness_of_fit(problem, finish, limits, result.x)
+        fit = assess_goodness_of_fit(problem, finish, limits, result.x if verdicts else None)
         covariance = misfit_robust_covariance(problem, finish, fit)
         estimates = parameter_estimates(problem, result.x, finish, covariance, fit if verdicts else None)
         found = *self._status_and_message(), problem.unknown_names, result.x, covariance, estimates, finish.cost, fit
