@@ -92,6 +92,11 @@ class EffectSettings:
     depends_on: Annotated[TorqueLawQuantitiesName | None, OptionInfo("quantities on which a law depends")] = None
     law_csv: Annotated[_FilePath | None, OptionInfo("table of a law, in the format of a diagnosis' law.csv")] = None
 
+    @property
+    def label(self) -> str:
+        """The label of the effect, `kind@location`."""
+        return f"{self.kind}@{self.location}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class _JointActuationSettings:

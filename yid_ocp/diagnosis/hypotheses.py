@@ -54,7 +54,7 @@ def make_candidate_effects(
     or is an effect of the system. Raises `ModelError` if a location does not exist.
     """
     where, sensors = "diagnosis.candidates", recorded_signal_kinds(recordings)
-    present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
+    present = {effect.label for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if choice == "all":
         return [_make_candidate(kind, place, system) for kind, place in possible]

@@ -119,11 +119,6 @@ class EffectBase(Effect):
         return self.parameters[f"{self.label}.{parameter}"].symbol
 
     @property
-    def label(self) -> str:
-        """The label of the effect, `kind@location`."""
-        return f"{self.kind}@{self.location}"
-
-    @property
     def neutral_values(self) -> dict[str, float]:
         """The parameter values at which the effect vanishes, by parameter name."""
         return {f"{self.label}.{q.name}": q.neutral_value for q in self.definitions}

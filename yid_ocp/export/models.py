@@ -150,12 +150,11 @@ def export_support_by_effect(system: System, values: Mapping[str, float], form: 
     """Return by label `kind@location` how well the format `form` (`mjcf`, `urdf` or `sdf`) supports each effect."""
     value, found = mjcf.CasadiEvaluator(system, values), dict[str, FeatureExportSupport]()
     for effect in system.effects:
-        label = f"{effect.kind}@{effect.location}"
         if value.is_effect_neutral(effect):
-            found[label] = NEUTRAL_EFFECT_SUPPORT
+            found[effect.label] = NEUTRAL_EFFECT_SUPPORT
         else:
             _, aspects = mjcf.effect_joint_terms_and_changed_aspects(system, effect, value)
-            found[label] = _worst([_aspect_support(x, form) for x in sorted(aspects)])
+            found[effect.label] = _worst([_aspect_support(x, form) for x in sorted(aspects)])
     return found
 
 

@@ -255,7 +255,7 @@ def _summed_terms(
     if missing := [name for name in names if name not in equations]:
         own = next(e for e in system.effects if missing[0] in e.internal_coordinate_symbols)
         what, hint = f"the internal coordinate '{missing[0]}' has no equation", "return one in `internal_equations`"
-        raise ModelError(what, where=f"{own.kind}@{own.location}", allowed="one equation per coordinate", hint=hint)
+        raise ModelError(what, where=own.label, allowed="one equation per coordinate", hint=hint)
     parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
     summed = ForceWithFactoredDerivatives(*(sum(rest, first) for first, *rest in parts)) if closed else None
     internal = [ca.vertcat(ca.SX(0, 1), *(rows[name] for name in names)) for rows in (equations, equations | at_rest)]

@@ -179,6 +179,11 @@ class Effect:
     # symbols that `apply_to_system` uses, by name `kind@location.joint`; they have no momentum
     internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
+    @property
+    def label(self) -> str:
+        """The label of the effect, `kind@location`."""
+        return f"{self.kind}@{self.location}"
+
     def apply_to_system(self, system: System) -> System:
         """Return the system with this effect, which may change masses, lengths, springs, grasps, gravity or joints."""
         return system
@@ -341,7 +346,7 @@ class System(ReprMixin):
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
         counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
         parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
-        parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
+        parts += [effect.label for effect in self.effects]
         return ReprTexts(", ".join(parts), self.parameters._summary().table_rows)
 
     @property

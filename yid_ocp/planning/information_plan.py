@@ -147,7 +147,7 @@ def _effects(
     if len(set(labels)) < 2:
         what, hint = f"two effects are needed, but the list has {len(set(labels))}", "list the effects to compare"
         raise ConfigError(what, where=where, allowed="two effects or more, such as joint_coulomb@JOINT", hint=hint)
-    there, found = {f"{effect.kind}@{effect.location}" for effect in problem.system.effects}, []
+    there, found = {effect.label for effect in problem.system.effects}, []
     for label in dict.fromkeys(labels):
         kind, _, place = label.partition("@")
         if not place:

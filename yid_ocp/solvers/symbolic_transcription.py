@@ -92,7 +92,7 @@ def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> No
     """Check that no effect changes recorded inputs or times, as node-state solvers require. Raises `SolverError`."""
     neutral = problem.predictor.are_input_corrections_neutral_and_fixed
     if not all(neutral(episode, problem.theta) for episode in problem.episodes):
-        names = ", ".join(f"{effect.kind}@{effect.location}" for effect in problem.system.effects)
+        names = ", ".join(effect.label for effect in problem.system.effects)
         message = f"{where} cannot handle an effect that changes recorded inputs, times or the tracking filter"
         allowed, hint = "effects on mechanics or sensor readings", "set solver.name: gauss_newton, or remove the effect"
         raise SolverError(message, where=f"one of the effects {names}", allowed=allowed, hint=hint)

@@ -126,7 +126,7 @@ def effect_joint_terms_and_changed_aspects(
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
-        size = effect.parameters[f"{effect.kind}@{effect.location}.tau_c"].symbol
+        size = effect.parameters[f"{effect.label}.tau_c"].symbol
         terms = {effect.location: JointDynamicsTerms(dry_friction=float(value(size)[0]))}
         aspects.add("dry_friction")
     elif effect.internal_coordinate_symbols:
@@ -426,7 +426,7 @@ def _refuse_inexpressible(system: System, value: CasadiEvaluator, standalone: bo
         if aspects := effect_joint_terms_and_changed_aspects(system, effect, value)[1] & lacking:
             changed = elements_by_aspect_and_file_format()[min(aspects)]["is"]
             what = f"MuJoCo cannot express what the effect changes: {changed}"
-            where, allowed = f"effect '{effect.kind}@{effect.location}'", "effects that docs/howto/export.md lists"
+            where, allowed = f"effect '{effect.label}'", "effects that docs/howto/export.md lists"
             hint = "leave the effect out of model.effects or model.friction"
             raise ModelError(what, where=where, allowed=allowed, hint=hint)
     for grasp in system.grasps:

@@ -196,7 +196,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     """The system with uncertain link masses, the effects, and the parameter values of the settings."""
     if run.model.arms.relative_link_mass_std > 0:
         system = system_with_mass_scale_parameters(system, _LINK_MASS_PARAMETER)
-    named = {f"{said.kind}@{said.location}" for said in run.model.effects}
+    named = {said.label for said in run.model.effects}
     for joint in friction_joint_names(run, system):
         assert run.model.friction is not None
         kinds, speed = EFFECT_KINDS_BY_FRICTION_LAW[run.model.friction.law], run.model.friction.sign_smoothing_speed
@@ -232,7 +232,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
 def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
     if said.kind != "law":
         if said.law_csv is not None or said.depends_on is not None:
-            what, where = "only an effect of kind: law has `law_csv` and `depends_on`", f"{said.kind}@{said.location}"
+            what, where = "only an effect of kind: law has `law_csv` and `depends_on`", said.label
             allowed, hint = f"kind: {said.kind} with `location` and `values`", "remove both keys, or set kind: law"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
         made = make_effect(said.kind, said.location, system, dict(said.values))
@@ -246,7 +246,7 @@ def _stated_effect(said: EffectSettings, system: System) -> EffectBase:
 
 def _with_robot_file_constants(run: RunSettings, system: System) -> System:
     """The system with armature, dry friction and servos of an MJCF file; settings and a friction law override these."""
-    present = {f"{said.kind}@{said.location}" for said in run.model.effects if said.values}
+    present = {said.label for said in run.model.effects if said.values}
     kinds = {"armature": ("rotor_inertia", "armature"), "frictionloss": ("joint_coulomb", "tau_c")}
     for joint, own in _robot_file_constants(run).items():
         if joint not in (*system.driven, *system.prescribed):

@@ -108,7 +108,7 @@ class _CalibratedModel:
         """Return the system with the effects `labels`; if `nominal`, only with those of them in the nominal model."""
         run = self.nominal_settings if nominal else self.settings
         kept = {"", *labels}
-        effects = tuple(effect for effect in run.model.effects if f"{effect.kind}@{effect.location}" in kept)
+        effects = tuple(effect for effect in run.model.effects if effect.label in kept)
         # names of parameters start with that of their effect
         names = [n for n in self.parameter_values if "@" not in n or n.rpartition(".")[0] in kept]
         parameters = {key: said for key, said in run.parameters.items() if key in names or fnmatch.filter(names, key)}
@@ -266,7 +266,7 @@ def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> d
             return {"status": "not done", "reason": "the run has no recordings"}
         import_mujoco("the replay needs MuJoCo")
         progress.begin_stage("replaying recordings in MuJoCo")
-        nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
+        nominal = calibrated.system([effect.label for effect in system.effects], nominal=True)
         system, nominal = (_with_recorded_points(own, recordings) for own in (system, nominal))
         recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
         before = _replayed(mujoco_xml(nominal, standalone=True), nominal, recordings, progress)

@@ -96,7 +96,7 @@ def group_parameter_values_by_effect_label(parameters: Mapping[str, float]) -> d
 
 def settings_with_added_effects(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
     """Return settings whose model also has `effects` (values by label). Effects that it has already are unchanged."""
-    present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
+    present = {effect.label for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
     return replace(run, model=replace(run.model, effects=(*run.model.effects, *added)))
@@ -220,7 +220,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[run_estimate
     if not runs:
         return run
     known, _, _ = run_estimates.pool_estimates_and_chi2(runs)
-    present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
+    present = {effect.label for effect in run.model.effects}
     estimated = group_parameter_values_by_effect_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
     names = [f"{label}.{quantity}" for label in added if label not in present for quantity in estimated.get(label, ())]

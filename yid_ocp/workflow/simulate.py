@@ -57,7 +57,7 @@ def run_simulate(
             is_short = (run.problem.duration or 0.0) > 1.01 * recording.duration
             is_noisy = noise or not run.recordings.estimate
             said = f"It has noise (seed {seed})." if is_noisy else "It has no noise. To add noise, write --noise."
-            acting = [f"{effect.kind}@{effect.location}" for effect in system.effects]
+            acting = [effect.label for effect in system.effects]
             said += f" Effects of the model that made it: {', '.join(acting)}." if acting else ""
             said += " The recorded motion is shorter than problem.duration." * is_short
             result |= {"status": "done", "message": said, "duration": recording.duration}
