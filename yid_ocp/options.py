@@ -168,7 +168,7 @@ def default_value_hint(key: str, option: Option) -> str:
     default, about = option.default_value, split_annotated(option.type_hint)[1]
     said = f"write an allowed value for {key}"
     if isinstance(default, (int, float, str)) or (default and isinstance(default, tuple)):
-        shown = default if isinstance(default, str) else json.dumps(default)
+        shown = default if isinstance(default, str) else json.dumps(default).replace("Infinity", ".inf")
         said = f"write {key}: {shown} (the default), or another allowed value"
     return said + "".join(f". Its meaning: {own.description}" for own in about if isinstance(own, OptionInfo))
 

@@ -220,7 +220,7 @@ def test_check(carried_out, pendulum):
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
-    assert "dynamics for this model and the file double_pendulum.urdf." in " ".join(done.out.split())
+    assert "kinematics of this model and the file double_pendulum.urdf." in " ".join(done.out.split())
 
 
 def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):
@@ -337,7 +337,7 @@ def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(printed, tmp
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
     told = printed("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
     assert "is not compared" not in told
-    assert "the same mass matrix, weight and inverse dynamics for this model" in " ".join(told.split())
+    assert "confirms the masses, inertias and kinematics of this model" in " ".join(told.split())
 
 
 def test_what_is_simulated_is_exported_and_imported(printed, pendulum_data, tmp_path):

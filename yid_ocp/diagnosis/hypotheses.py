@@ -72,7 +72,8 @@ def make_candidate_effects(
         cls = EFFECTS[kind]
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
-            missing = ", ".join(sorted(cls.required_sensors - sensors))
+            has_place = (cls.candidate_locations or cls.possible_locations)(system)
+            missing = ", ".join(sorted(cls.required_sensors - sensors)) if has_place else ""
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
             allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), f"remove {kind} from this list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)

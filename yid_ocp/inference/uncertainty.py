@@ -27,10 +27,10 @@ ConfidenceInterval = tuple[float | None, float | None]
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
 HOPELESS_CHI2 = 1e3  # per degree of freedom: units, signs or names are probably wrong
+_POSSIBLE_NOISE_CHI2 = 25.0  # per degree of freedom, up to which stated noise that is too small can be the cause
 # A standard deviation of this many times the value (or its typical size) counts as infinite.
 MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
-# A value this close to its bound, in units of the unknown's typical size, counts as at the bound.
-_AT_BOUND_FRACTION = 1e-4
+_AT_BOUND_FRACTION = 1e-4  # distance from a bound, over the unknown's typical size, that counts as at the bound
 # 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
 _CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
 # Number of time blocks into which all recordings are cut if misfit is included, and their limits of length [s].
@@ -501,9 +501,9 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         too_large = overstated_noise_sentence(chi2_per_dof, p_value)
         return f"The model explains the recordings to within their noise ({size}).{too_large}"
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
-    checks = "check units, signs, names and noise and "
-    if chi2_per_dof * fraction**2 <= HOPELESS_CHI2:
-        checks = f"check the stated noise (is it {chi2_per_dof**0.5:.2g} times as large?) and " * (fraction == 1)
+    checks = "check units, signs, names and noise and " * (chi2_per_dof * fraction**2 > HOPELESS_CHI2)
+    if fraction == 1 and chi2_per_dof <= _POSSIBLE_NOISE_CHI2:
+        checks = f"check the stated noise (is it {chi2_per_dof**0.5:.2g} times as large?) and "
     return f"{said} To find the cause, {checks}run `yid-ocp diagnose`." if with_advice else said
 
 

@@ -484,7 +484,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         rest = [entry["name"] for entry in runs if not entry["distrusted"]]
         said = f"Either the values changed before {names}, or the recording is faulty. Repeat it before you use them."
         if set(poor).intersection(rest):
-            said = f"This does not make {names} doubtful, because not all other runs explain their recordings."
+            said = f"The model does not explain {abbreviated_names_text(poor)}, so it is open which run is faulty."
         yield f"The other runs ({abbreviated_names_text(rest)}) agree with each other much better than with {names}."
         yield said
     elif drifted:

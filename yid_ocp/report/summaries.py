@@ -430,7 +430,7 @@ def _place_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     rows.append(("largest distance of the point from the target", f"{1e3 * result['error']:.3g}", *near))
     rows.append(("largest speed of any point of the object", f"{1e3 * result['swing']:.3g}", *fastest))
     if result["off_path"] is not None:
-        rows.append(("largest distance from the path, before", f"{1e3 * result['off_path']:.3g}", "", "", "mm"))
+        rows.append(("largest distance from the path, in the motion", f"{1e3 * result['off_path']:.3g}", "", "", "mm"))
     for axis, std in zip("xyz", result["std"] or (), strict=False):
         rows.append((f"std of the position in {axis}, from uncertain parameters", f"{1e3 * std:.2g}", *near))
     yield SummaryTable(rows, f"Prediction of the model for the {result['settle']:g} s after the motion")
@@ -495,7 +495,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    yield f"Pinocchio gets the same mass matrix, weight and inverse dynamics for {agreed}." if agreed else ""
+    yield f"The library Pinocchio confirms the masses, inertias and kinematics of {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
     noise = dict[Sequence[str], list[str]]()  # names of the recordings by noise of a channel
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps

@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Len
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, nearest_name_question
+from yid_ocp.errors import ConfigError, DataError, nearest_name_question, require_known_names
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeStateSymbols, System
 from yid_ocp.options import OptionInfo
@@ -198,6 +198,7 @@ def expand_to_joint_values(
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
+                require_known_names(given, recorded, "recorded joint", key, ConfigError)
                 allowed, hint = f"a value for each of {', '.join(names)}", f"add {name}: NUMBER to {key}"
                 raise ConfigError(f"'{name}' has no value", where=key, allowed=allowed, hint=hint)
         return np.array([float(given[name]) for name in names])

@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +196,8 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
         return None
     try:
         require_runs_of_one_model(folders)
-        return run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(list(map(read_estimates, folders))))
+        runs = [replace(read_estimates(folder), run_name=folder.name) for folder in folders]
+        return run_drift_and_outliers_to_dict(assess_drift_and_outlier_runs(runs))
     except YidError:
         return None
 

@@ -197,7 +197,7 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     h = run.problem.time_step_or_10_ms if problem is None else problem.step.time_step
     names = (*system.driven, *system.prescribed)
     if names and problem is None:
-        return found | {"message": "Natural frequencies need a recording, which gives the posture."}
+        return found | {"message": "No natural frequencies are computed, because the posture comes from a recording."}
     theta, guess, posture = system.parameters.vector(), None, dict[str, float]()
     rule = (run.problem.force_split, run.problem.constraint_force_at)
     if problem is not None:

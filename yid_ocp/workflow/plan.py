@@ -236,7 +236,7 @@ def _information_plan_result(found: InformativeMotionPlan) -> dict[str, Any]:
 
 
 def discrimination_plan_settings(
-    confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
+    confusable: Sequence[Sequence[Mapping[str, str]]], folder: str | Path
 ) -> dict[str, Any] | None:
     """Return settings of `plan` for a motion that distinguishes the first confusable effects. None without any."""
     if not confusable:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording, raise_data_error_unless
+from yid_ocp.display import count_with_noun
 from yid_ocp.errors import DataError, import_optional
 from yid_ocp.files import check_input_file, check_not_too_many_numbers, file_sha256, read_input_json
 
@@ -113,7 +114,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
-    said = f"{info.total_episodes} episodes at {info.fps:g} Hz, {info.codebase_version}"
+    said = f"{count_with_noun(info.total_episodes, 'episode')} at {info.fps:g} Hz, {info.codebase_version}"
     robot = info.robot_type
     return base.FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
