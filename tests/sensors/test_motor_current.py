@@ -148,6 +148,11 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(), {}, "motors' torque constants are not stated"),
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "torque constant of joint 'shoulder' is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "'shoulder' has no value"),
+        (
+            SensorOptions(constants={"torque_constant": {"elbow": 1.0, "sholder": 1.0}}),
+            {},
+            "no recorded joint 'sholder'",
+        ),
         (KNOWN, {"noise_and_bias_stds_by_attribute": {}}, "standard deviation of the noise of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder', whose current is recorded"),
         (replace(KNOWN, use=False), {}, "no sensor of the model has a measurement"),

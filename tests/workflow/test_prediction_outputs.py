@@ -215,6 +215,14 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
     assert all((d.cause, d.severity, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
 
+def test_an_estimate_that_its_prior_contradicts_is_in_doubt():
+    problem = SimpleNamespace(options=SimpleNamespace(prior_stds={"k": 5.0}))
+    for value, places in ((124.0, []), (76.0, []), (126.0, ["parameters.k"])):
+        known = {name: SimpleNamespace(value=value, initial=100.0, unit="N/m") for name in ("k", "j")}
+        found = estimation._contradicted_prior_issues(problem, SimpleNamespace(parameters=known))
+        assert [(own.group, own.severity) for own in found] == [(place, "not_trusted") for place in places]
+
+
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}

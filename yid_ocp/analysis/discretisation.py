@@ -454,6 +454,8 @@ def estimates_widened_by_discretisation_error(
             low, high = interval
             low = None if low is None else max(low - further, entry.lower)
             interval = low, None if high is None else min(high + further, entry.upper)
+        if verdict == "not_identifiable":
+            std, interval = math.inf, None
         counted[name] = replace(entry, std=std, verdict=verdict, interval=interval)
     return counted
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -145,6 +146,7 @@ def _checked_solution_and_issues(
     found = clock_and_noise_issues_from_residuals(problem, solution.x, solution.evaluation)
     if solution.goodness_of_fit.data_trusted:  # wrong data make a model worse than a guess
         found += _worse_than_baseline_issues(errors, units)
+    found += _contradicted_prior_issues(problem, solution) if solution.goodness_of_fit.explains else []
     if any(issue.severity != "warning" for issue in found):
         untrusted = replace(solution.goodness_of_fit, data_trusted=False)
         marked = uncertainty.mark_free_estimates_not_trusted(solution.parameters)
@@ -249,6 +251,7 @@ BASELINE_DESCRIPTIONS = {
     "linear_carry": "points on lines between the clamps",
 }
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
+_MAX_STDS_FROM_PRIOR = 5.0  # a stated prior that is farther from the estimate is wrong
 _N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
 _MAX_OFFSET_IN_STDS = 3.0  # of a constant error or clock that counts as noise
 
@@ -365,6 +368,21 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])
                 found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
+    return found
+
+
+def _contradicted_prior_issues(problem: EstimationProblem, solution: Solution) -> list[Issue]:
+    """Return an issue for each estimate that is far from its stated prior."""
+    found = []
+    for name, entry in solution.parameters.items():
+        std = problem.options.prior_stds.get(name.split("[")[0], math.inf)
+        stds = abs(entry.value - entry.initial) / std
+        if stds > _MAX_STDS_FROM_PRIOR:
+            what = f"the estimate of {name} is {entry.value:.4g} {entry.unit}, but its prior is {entry.initial:.4g} ± "
+            what += f"{std:.2g} (up to {_MAX_STDS_FROM_PRIOR:g} times this ± is tolerated)"
+            advice = f"correct parameters.{name}.initial, or remove its prior_std, because it makes the values wrong"
+            ratio, place = stds / _MAX_STDS_FROM_PRIOR, ("", f"parameters.{name}")
+            found.append(Issue("contradicted_prior", what, "not_trusted", ratio, advice, *place))
     return found
 
 

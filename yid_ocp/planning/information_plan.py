@@ -55,7 +55,6 @@ class InformativeMotionPlan(PlannedMotion):
     # effect and all free unknowns [data stds], in the existing recordings and in the planned one; empty without effects
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
     start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
-    best_start_index: int
     active_limits: Mapping[str, tuple[str, ...]]  # joints, springs or frames that reach a limit, by kind of limit
     unobservable_parameters: Mapping[str, str]  # parameters that no motion informs, each with a measurement that would
     unidentifiable_directions: tuple[str, ...]  # sentences on what else the planned recording leaves unidentifiable
@@ -275,8 +274,7 @@ def _plan(
     unseen: Mapping[str, float],
 ) -> InformativeMotionPlan:
     judged = [replace(one, configured_criterion=_judged(experiment, criterion, one)) for one in found]
-    best = int(np.argmax([one.configured_criterion for one in judged]))
-    chosen = judged[best]
+    chosen = max(judged, key=lambda one: one.configured_criterion)
     if not np.isfinite(chosen.configured_criterion):
         what = f"the simulation of the model by planned torques failed for all {len(found)} motions"
         hint = "lower plan.limits.max_acceleration, or plan more motions: plan.n_random_starts: 20"
@@ -299,7 +297,6 @@ def _plan(
         parameter_precisions=precisions,
         effect_distances=_distances(experiment, criterion, rivals, w) if rivals else {},
         start_results=tuple(judged),
-        best_start_index=best,
         active_limits=_active(search, limits, w),
         unobservable_parameters=lost,
         unidentifiable_directions=tuple(words for words, name in unidentifiable.items() if name not in lost),

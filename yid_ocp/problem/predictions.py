@@ -92,8 +92,8 @@ class ChannelPrediction(ReprMixin):
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def predicted_at(self, t: Array) -> Array:
-        """Interpolate the prediction linearly to other times `t` (K,) [s]. Returns shape (K, w)."""
-        return np.stack([np.interp(t, self.t, column) for column in self.predicted.T], axis=1)
+        """Interpolate the prediction linearly to other times `t` (K,) [s]; NaN outside it. Returns shape (K, w)."""
+        return np.stack([np.interp(t, self.t, column, np.nan, np.nan) for column in self.predicted.T], axis=1)
 
     def _summary(self) -> ReprTexts:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"

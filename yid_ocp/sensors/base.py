@@ -196,9 +196,9 @@ def expand_to_joint_values(
 ) -> Array:
     """Return a value for each joint in `names`, from one value, an array over the `recorded` joints or a mapping."""
     if isinstance(given, Mapping):
+        require_known_names(given, recorded, "recorded joint", key, ConfigError)
         for name in names:
             if name not in given:
-                require_known_names(given, recorded, "recorded joint", key, ConfigError)
                 allowed, hint = f"a value for each of {', '.join(names)}", f"add {name}: NUMBER to {key}"
                 raise ConfigError(f"'{name}' has no value", where=key, allowed=allowed, hint=hint)
         return np.array([float(given[name]) for name in names])
