@@ -172,9 +172,10 @@ def _hidden_changes(result: DiagnosisResult) -> list[str]:
     for name in {*fit.problem.shared_parameters} - offsets:
         changes = ((own.hidden_changes.get(name, 0.0), own.effect.label) for own in result.screening.detectability)
         most, label = max(changes, default=(0.0, ""))
-        limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * abs(fit.values[name])
+        size = abs(fit.values[name])  # beyond which a linear forecast of the change is meaningless
+        limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD * size
         change = f"{name} by up to {_short(most)} {system.parameters[name].unit}".removesuffix(" 1")
-        told += _said((fit.std[name] < limit < most, (limit / max(most, 1e-300), f"{change} ({label})")))
+        told += _said((fit.std[name] < limit < most < size, (limit / max(most, 1e-300), f"{change} ({label})")))
     hidden = "But an effect that is too small for these recordings to show may change found values by more than 10 %"
     return _said((told, f"{hidden}: {listed([text for _, text in sorted(told)], _MAX_NAMED)}."))
 
@@ -260,7 +261,7 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
         (lost, (other_channels, f"Hold out a recording that has {lost}, too.")),
         (result.unknown_reason and alike[1:], (several, f"{add}`yid-ocp diagnose`.")),
         (result.untried, (f"{limit}{listed(result.untried)}.", _LONGER_SEARCH)),
-        (laws, (other, "Compare friction laws by `yid-ocp friction`. It needs recordings of two motions or more.")),
+        (laws, (other, "Compare friction laws by `yid-ocp friction`.")),
         (stated != used, (finer, f"For other commands, set problem.time_step: {used}.")),
         (result.is_split_in_blocks, (blocks, "")),
         (result.is_corrected_for_links, (links, f"For other commands, set {more_links}.")),

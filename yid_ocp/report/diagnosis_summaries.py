@@ -66,7 +66,7 @@ def _diagnose_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from () if is_severe else issue_summary_blocks(result)
     before, steps, noise = result["gap"]["before"], result.get("steps", ()), result["gap"].get("noise")
     added = (f"+ {step['added']}" for step in steps)
-    rows: TableRows = [("channel", "nominal model", *added, *["noise alone"] * bool(noise), "unit")]
+    rows: TableRows = [("channel", "nominal model", *added, *["sensor noise"] * bool(noise), "unit")]
     for channel, error in before["rmse"].items():
         errors = [error, *(step["rmse"].get(channel) for step in steps), *([noise.get(channel)] if noise else [])]
         shown = [value_text_and_display_unit(value, before["unit"][channel]) for value in errors]
@@ -134,7 +134,7 @@ def _candidate_rows(result: Mapping[str, Any], is_open: bool) -> TableRows:
         label = effect_entry_label(entry)
         ends = (p_value_text(entry["p_value"]), verdicts.get(label, ""))
         if entry["closure"] is not None:
-            percent = f"{100 * abs(entry['closure']):.3g} %"
+            percent = f"{100 * abs(entry['closure']):.3g} %" if entry["closure"] > -10 else "over 1000 %"
             rows.append((label, ", ".join(values), "adds " * (entry["closure"] < 0) + percent, *ends))
         elif label in verdicts:
             how = "fitted beside others only" if label in added else "not fitted alone (values: forecast)"

@@ -137,7 +137,8 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     if result["fit"]["data_trusted"] and not result["fit"]["explains"]:
         steps["find the cause of the model's error"] = "diagnose"
     elif result["fit"]["data_trusted"] and len(lost) < len(free):
-        steps["test whether the model lacks an effect"] = "diagnose"
+        efforts = " --set sensors.joints.effort.use=true" * bool(result.get("unused_efforts"))
+        steps["test whether the model lacks an effect"] = f"diagnose{efforts}"
     if lost and result["fit"]["explains"]:
         steps["rank experiments that determine the missing parameters (takes minutes)"] = "identifiability --what-if"
     if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):

@@ -132,7 +132,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         rows.append((ISSUE_CAUSE_DESCRIPTIONS[cause], where, first["certainty"]))
         options = [*advised_options((first, *others)).values()]
         do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if options else ".")
-        example = " at the first place," * any(own["what"] != first["what"] for own in others)
+        example = f" at {first['where']}," * any(own["what"] != first["what"] for own in others)
         text = f"{where} (error: {first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
         advice += [text, CodeBlock("\n".join(options))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:

@@ -412,7 +412,7 @@ def _meanings(
         both = units.setdefault(quantity, unit), unit
         if len({base.factor_to_si_by_quantity({quantity: one}, where)[quantity] for one in both}) > 1:
             what, allowed = f"some columns of {quantity} are in {both[0]}, others in {both[1]}", "one unit per quantity"
-            raise DataError(what, where=where, allowed=allowed, hint=f"convert all of them to {both[0]} in the file")
+            raise DataError(what, where=where, allowed=allowed, hint="convert lengths to m and angles to rad")
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given and name.lower() not in COUNTER_WORDS:

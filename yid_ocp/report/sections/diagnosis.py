@@ -63,7 +63,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     for channel, (error, unit) in before.items():
         factor, shown = scale_and_unit_with_metres_as_mm(unit)
         extended = after[channel][0] if changed and channel in after else None
-        errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "noise alone": floor.get(channel)}
+        errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "sensor noise": floor.get(channel)}
         rows.append((channel, shown, {name: (factor * e, None) for name, e in errors.items() if e is not None}))
     sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
@@ -73,7 +73,7 @@ def _figures_by_model(
     rows: Sequence[tuple[str, str, Mapping[str, tuple[float, float | None]]]], axis: str, nominal_label: str
 ) -> _TitledFigures:
     colors = {nominal_label: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
-    colors["noise alone"] = figures.MEASURED_COLOR
+    colors["sensor noise"] = figures.MEASURED_COLOR
     draw = figures.parameter_values_by_source_figure
     return draw_figure_per_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]".removesuffix(" []"), colors))
 
