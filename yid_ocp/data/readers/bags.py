@@ -245,7 +245,8 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     if any(message.content.axes is not None for message in bag.places if message.source in names):
         notes.append("poses have orientations. --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
     units, why = base.guess_non_si_units(_for_guess(bag, names))
-    told = (("command_topic", command), ("point_names", names), ("units", units))
+    has_equal_names = len({*names.values()}) < len(names)  # which an import refuses
+    told = (("command_topic", command), ("point_names", names if has_equal_names else {}), ("units", units))
     options |= {key: found for key, found in told if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
