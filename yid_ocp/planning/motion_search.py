@@ -193,8 +193,8 @@ class MotionToTargetResult:
 class MotionToTargetSearch:
     """A search for the motion that reaches a target best in all `cases` of parameters. Limits hold for the first."""
 
-    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
-        self._cases, self._shape = list(cases), shape
+    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions]) -> None:
+        self._cases, self._shape = list(cases), cases[0].quasi_static_coefficients.shape
         self._residual_and_limit_values = functools.lru_cache(maxsize=1)(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
 
@@ -209,14 +209,14 @@ class MotionToTargetSearch:
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
-    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> MotionToTargetResult:
+    def solve(self, start: Array, iterations: int) -> MotionToTargetResult:
         """Optimise the spline coefficients (K, nc) of a motion: K coefficients for each of nc prescribed joints.
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
-        bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
-        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
+        bounds of the coefficients are enforced by an interior trust-region method (Branch, Coleman and Li 1999,
+        doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
         """
-        low, high = lower.ravel(), upper.ravel()
+        low, high = (bound.ravel() for bound in self._cases[0].simulator.coefficient_bounds())
         x, pull = np.clip(start.ravel(), low + 1e-9, high - 1e-9), np.zeros((2, len(self._unit)))
         penalty, before, ended = _INITIAL_PENALTY, np.inf, False
         for _ in range(_MAX_OUTER_ITERATIONS):
