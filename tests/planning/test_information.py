@@ -8,6 +8,7 @@ import pytest
 from small_problems import pendulum_step, taken
 
 from yid_ocp.analysis.identifiability import identifiability
+from yid_ocp.display import NULL_PROGRESS
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
@@ -139,11 +140,11 @@ def test_distances_are_what_others_cannot_explain():
     rows = np.zeros((6, 7))
     rows[[0, 1, 2], [3, 4, 5]] = 50.0, 20.0, 10.0
     rows[0, 0] = 1e4  # a free parameter does to the data what the first effect does
-    first, second = criterion.pairwise_imitation_distances(rows)[[0, 1], [1, 0]]
+    first, second = criterion.imitation_distance(rows, 0, 1), criterion.imitation_distance(rows, 1, 0)
     assert first < 0.2
     assert second == pytest.approx(np.sqrt((10.0**2 + 30.0**2) / 2))
     rows[3, 3] = 7.0  # now a reading of its own
-    assert criterion.pairwise_imitation_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
+    assert criterion.imitation_distance(rows, 0, 1) == pytest.approx(14.0, rel=1e-3)
 
 
 def line(w):
@@ -161,11 +162,11 @@ def searched(limits, rounds=50):
     bounds = np.full((2, 1), -1.0), np.full((2, 1), 1.5)
     simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
     read = {"sensitivities_to_unknowns": line, "sensitivity_derivatives_by_coefficients": slopes}
-    experiment = SimpleNamespace(simulator=simulator, **read)
+    experiment = SimpleNamespace(simulator=simulator, planned_recording_sensitivities=line, **read)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
     kept = SimpleNamespace(limit_rows=bounded, constraints_and_jacobian=lambda rolled, w: values(w.ravel()))
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
-    return search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
+    return search.improve_motion(np.array([[0.1], [-0.05]]), rounds, NULL_PROGRESS)
 
 
 def straight(matrix):

@@ -78,7 +78,7 @@ def test_slopes_are_derivatives(moved, wanted, more):
     simple = mover.path.straight_line_coefficients([0.4])
     inside = frames if options.box else None
     rows = PlanResidualAndLimitFunctions(mover, options, frames, np.array(options.target_position), simple, inside)
-    shooting = MotionToTargetSearch([rows], simple.shape)
+    shooting = MotionToTargetSearch([rows])
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
     before, after, here = (shooting._residual_and_limit_values(tuple(y)) for y in (x - e * way, x + e * way, x))

@@ -265,7 +265,8 @@ def test_speed_and_time_enter_the_standard_deviation(clean):
     assert (fast > 0.8 * 2.0 * std_of(found)).all()
     assert (found.point_std_from_calibration(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
     assert (rest > 0).all()
-    nothing = calibration.calibration_without_estimation(POSE, CameraClockOptions(initial_stamp_minus_joint_time=0.1))
+    clock = CameraClockOptions(initial_stamp_minus_joint_time=0.1)
+    nothing = calibration.calibration_without_estimation(POSE, clock, "nothing moves")
     assert nothing.point_std_from_calibration(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
     assert nothing.camera_state.stamps_to_joint_clock(1.0) == pytest.approx(0.9)
 

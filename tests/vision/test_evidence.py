@@ -36,7 +36,11 @@ def wall(x, y, z, step=0.006):
     return np.column_stack([across[0].ravel(), across[1].ravel(), np.full(across[0].size, z)])
 
 
-def asked(points, behind=None, removed=None):
+def nowhere(places):
+    return np.zeros(len(places), bool)
+
+
+def asked(points, behind=None, removed=nowhere):
     view = OcclusionMap(points if behind is None else np.concatenate([points, behind]), np.eye(4))
     return fit_quality_and_point_classes(
         TUBES, ProcessedFrameCloud(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
@@ -100,7 +104,7 @@ def test_points_on_a_swath_are_wider_than_the_tube_and_tubes_are_slender():
     assert np.sqrt(blurred.excess_variance) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
-    cloud = ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA)
+    cloud = ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA, OcclusionMap(points, np.eye(4)), nowhere)
     thin, mine = tube_like_node_and_point_masks(cloud, RADIUS)
     assert thin.tolist() == [True, True, False]
     assert mine.sum() == len(tube())

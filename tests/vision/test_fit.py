@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,7 +39,13 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
     cloud = np.concatenate(points)
     sight = cloud - CAMERA
     cloud = cloud + noise * rng.standard_normal(len(cloud))[:, None] * sight / np.linalg.norm(sight, axis=1)[:, None]
-    return ProcessedFrameCloud(cloud, np.ones(len(cloud)), np.array(nodes), CAMERA)
+    view = SimpleNamespace(occluded_position_mask=nowhere)
+    return ProcessedFrameCloud(cloud, np.ones(len(cloud)), np.array(nodes), CAMERA, view, nowhere)
+
+
+def nowhere(places, *_):
+    """No position is hidden or filtered out."""
+    return np.zeros(len(places), bool)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,9 +98,8 @@ def plan_informative_motion(
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionEvaluator(system, system.point_frames)
     limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
-    criterion = _criterion(experiment, chosen, rivals)
-    search = InformativeMotionSearch(experiment, limits, criterion)
-    _check_room(search, limits)
+    search = InformativeMotionSearch(experiment, limits, _criterion(experiment, chosen, rivals))
+    _check_room(search)
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
@@ -113,7 +112,7 @@ def plan_informative_motion(
     for i, (begin, _) in enumerate(begins):
         progress.begin_stage(f"improving random motion {i + 1} of {len(begins)}")
         found.append(search.improve_motion(begin, options.max_iterations, progress))
-    return _plan(experiment, limits, search, criterion, found, rivals, unseen)
+    return _plan(search, found, rivals, unseen)
 
 
 def _chosen(
@@ -182,7 +181,7 @@ def _size(effect: EffectBase) -> Array:
     return np.diag([(high - low) / 2 for low, high in ranges])
 
 
-def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions) -> None:
+def _check_room(search: InformativeMotionSearch) -> None:
     """Raise `ConfigError` if the arms violate their limits at the start."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     starts = mover.moved_joint_start_positions
@@ -192,8 +191,8 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualAndLimitFun
             what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
             where, hint = "plan.start_joint_positions", f"set plan.start_joint_positions.{name} within its limits"
             raise ConfigError(what, where=where, allowed=f"{at + low:.4g} to {at + high:.4g} {unit}", hint=hint)
-    values, _ = limits.constraints_and_jacobian(mover.simulate_path(still), still)
-    if broken := limits.worst_value_and_bound_by_violated_limit(values):
+    values, _ = search.limits.constraints_and_jacobian(mover.simulate_path(still), still)
+    if broken := search.limits.worst_value_and_bound_by_violated_limit(values):
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{what} of {name} is {x:.4g}, limit {bound:.4g}" for what, name, x, bound in parts)
         hint = "widen plan.limits if the robot allows it, or set another plan.start_joint_positions"
@@ -265,16 +264,13 @@ def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
 
 
 def _plan(
-    experiment: SplineMotionExperiment,
-    limits: PlanResidualAndLimitFunctions,
     search: InformativeMotionSearch,
-    criterion: MotionSearchCriterion,
     found: Sequence[MotionSearchResult],
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
 ) -> InformativeMotionPlan:
-    judged = [replace(one, configured_criterion=_judged(experiment, criterion, one)) for one in found]
-    chosen = max(judged, key=lambda one: one.configured_criterion)
+    experiment = search.experiment
+    chosen = max(found, key=lambda one: one.configured_criterion)
     if not np.isfinite(chosen.configured_criterion):
         what = f"the simulation of the model by planned torques failed for all {len(found)} motions"
         hint = "lower plan.limits.max_acceleration, or plan more motions: plan.n_random_starts: 20"
@@ -295,20 +291,12 @@ def _plan(
         chosen.is_converged,
         message,
         parameter_precisions=precisions,
-        effect_distances=_distances(experiment, criterion, rivals, w) if rivals else {},
-        start_results=tuple(judged),
-        active_limits=_active(search, limits, w),
+        effect_distances=_distances(search, rivals, w) if rivals else {},
+        start_results=tuple(found),
+        active_limits=_active(search, w),
         unobservable_parameters=lost,
         unidentifiable_directions=tuple(words for words, name in unidentifiable.items() if name not in lost),
     )
-
-
-def _judged(experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, found: MotionSearchResult) -> float:
-    try:
-        rows = experiment.planned_recording_sensitivities(found.w)
-    except SolverError:
-        return -math.inf
-    return criterion.value_and_gradient_wrt_sensitivities(rows)[0]
 
 
 def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], dict[str, str]]:
@@ -331,20 +319,19 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
 
 
 def _distances(
-    experiment: SplineMotionExperiment, criterion: MotionSearchCriterion, rivals: Sequence[EffectBase], w: Array
+    search: InformativeMotionSearch, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
+    experiment, criterion, found = search.experiment, search.criterion, {}
     assert isinstance(criterion, EffectDiscriminationCriterion)
     recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
-    before, after = criterion.pairwise_imitation_distances(recorded), criterion.pairwise_imitation_distances(planned)
-    labels = [effect.label for effect in rivals]
-    pairs = itertools.permutations(range(len(labels)), 2)
-    return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}
+    for (i, one), (j, other) in itertools.permutations(enumerate(rivals), 2):
+        distances = criterion.imitation_distance(recorded, i, j), criterion.imitation_distance(planned, i, j)
+        found[one.label, other.label] = distances
+    return found
 
 
-def _active(
-    search: InformativeMotionSearch, limits: PlanResidualAndLimitFunctions, w: Array
-) -> dict[str, tuple[str, ...]]:
-    mover, found = search.experiment.simulator, {}
+def _active(search: InformativeMotionSearch, w: Array) -> dict[str, tuple[str, ...]]:
+    mover, limits, found = search.experiment.simulator, search.limits, {}
 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))

@@ -179,11 +179,10 @@ def _check_box(options: PlanOptions, inside: FramePositionEvaluator, at: Array, 
 
 def _attempt(rows: PlanResidualAndLimitFunctions, known: ParameterCovarianceBeforePlan) -> TargetMotionPlan:
     """Find the best motion of one duration, refined with shorter time steps to resolve residual motion."""
-    options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
-    lower, upper = mover.coefficient_bounds()
+    options, guess, evaluations = rows.options, rows.quasi_static_coefficients, 0
     for halved in range(_MAX_STEP_HALVINGS + 1):
         cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
-        shot = MotionToTargetSearch(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
+        shot = MotionToTargetSearch(cases).solve(guess, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break

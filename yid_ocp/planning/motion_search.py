@@ -21,7 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares, minimize
 
 from yid_ocp.arrays import Array
-from yid_ocp.display import NULL_PROGRESS, Progress
+from yid_ocp.display import Progress
+from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PathSimulator, PlanOptions
@@ -192,8 +193,8 @@ class MotionToTargetResult:
 class MotionToTargetSearch:
     """A search for the motion that reaches a target best in all `cases` of parameters. Limits hold for the first."""
 
-    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions], shape: tuple[int, int]) -> None:
-        self._cases, self._shape = list(cases), shape
+    def __init__(self, cases: Sequence[PlanResidualAndLimitFunctions]) -> None:
+        self._cases, self._shape = list(cases), cases[0].quasi_static_coefficients.shape
         self._residual_and_limit_values = functools.lru_cache(maxsize=1)(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
 
@@ -208,14 +209,14 @@ class MotionToTargetSearch:
         assert by_w is not None
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
-    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> MotionToTargetResult:
+    def solve(self, start: Array, iterations: int) -> MotionToTargetResult:
         """Optimise the spline coefficients (K, nc) of a motion: K coefficients for each of nc prescribed joints.
 
         The limits of the motion are enforced by an augmented Lagrangian (Rockafellar 1973, doi:10.1007/BF01580138). The
-        bounds `lower` and `upper` of the coefficients are enforced by an interior trust-region method (Branch, Coleman
-        and Li 1999, doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
+        bounds of the coefficients are enforced by an interior trust-region method (Branch, Coleman and Li 1999,
+        doi:10.1137/S1064827595289108), with at most `iterations` evaluations per multiplier update.
         """
-        low, high = lower.ravel(), upper.ravel()
+        low, high = (bound.ravel() for bound in self._cases[0].simulator.coefficient_bounds())
         x, pull = np.clip(start.ravel(), low + 1e-9, high - 1e-9), np.zeros((2, len(self._unit)))
         penalty, before, ended = _INITIAL_PENALTY, np.inf, False
         for _ in range(_MAX_OUTER_ITERATIONS):
@@ -296,12 +297,9 @@ class EffectDiscriminationCriterion:
     amplitude_cases: tuple[Array, ...]
     parameter_columns: tuple[int, ...]  # columns with a prior: nominal parameters and parameters of effects
 
-    def pairwise_imitation_distances(self, rows: Array) -> Array:
-        """Return the distance [data stds] of each effect (row) from its best imitation by another (column)."""
-        found = np.full((len(self.amplitude_columns),) * 2, np.inf)
-        for i, j in itertools.permutations(range(len(found)), 2):
-            found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
-        return found
+    def imitation_distance(self, rows: Array, i: int, j: int) -> float:
+        """Return the distance [data stds] of effect i from its best imitation by effect j."""
+        return float(np.sqrt(self._apart(rows, i, j)[0]))
 
     def value_and_gradient_wrt_sensitivities(self, rows: Array) -> tuple[float, Array]:
         """Return the criterion [nat] and its gradient (nr, nx) by the sensitivities `rows`."""
@@ -345,7 +343,7 @@ class MotionSearchResult:
     final_criterion: float
     is_converged: bool
     n_iterations: int
-    configured_criterion: float = -np.inf  # at w in the configured problem; minus infinity if its rollout fails
+    configured_criterion: float  # at w in the configured problem; minus infinity if its rollout fails
 
 
 class InformativeMotionSearch:
@@ -381,7 +379,7 @@ class InformativeMotionSearch:
         rows = self.experiment.sensitivities_to_unknowns(w)
         return -np.inf if rows is None else self.criterion.value_and_gradient_wrt_sensitivities(rows)[0], rows
 
-    def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
+    def improve_motion(self, start: Array, rounds: int, progress: Progress) -> MotionSearchResult:
         """Maximise the criterion in at most `rounds` rounds from coefficients `start` (K, nc) within the limits."""
         w, radius = start, _INITIAL_TRUST_RADIUS
         value, rows = self._value_and_rows(w)
@@ -411,7 +409,14 @@ class InformativeMotionSearch:
             finished = gained < _MIN_GAIN and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:
                 break
-        return MotionSearchResult(w, first, value, finished, done)
+        return MotionSearchResult(w, first, value, finished, done, self._configured_criterion(w))
+
+    def _configured_criterion(self, w: Array) -> float:
+        try:
+            rows = self.experiment.planned_recording_sensitivities(w)
+        except SolverError:
+            return -np.inf
+        return self.criterion.value_and_gradient_wrt_sensitivities(rows)[0]
 
     def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
         """The best step of the linearised problem within a trust region, shortened until the true limits hold."""

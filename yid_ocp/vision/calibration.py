@@ -212,13 +212,12 @@ class CameraCalibration:
         return np.asarray(np.sqrt(variance + np.maximum(np.abs(beside), evenly) ** 2))
 
 
-def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
+def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str) -> CameraCalibration:
     """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    text = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
-    text += f" (not estimated, because {reason})" * bool(reason)
+    known = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
     state, zero = CameraState(pose, clock_offset=offset), np.zeros(CAMERA_STATE_SIZE)
-    return CameraCalibration(state, None, np.diag(zero), zero, None, 0, text)
+    return CameraCalibration(state, None, np.diag(zero), zero, None, 0, f"{known} (not estimated, because {reason})")
 
 
 def calibrate_camera(

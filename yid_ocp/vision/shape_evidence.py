@@ -130,8 +130,8 @@ class ProcessedFrameCloud:
     point_weights: Array  # (N,)
     skeleton_nodes: Array  # (K, 3), nodes of the points' skeleton [m]
     camera_position: Array  # (3,) [m]
-    occlusion_map: OcclusionMap | None = None  # of all measured points; None: no position counts as hidden
-    is_filtered_out: Callable[[Array], BoolArray] | None = None  # positions (S, 3) removed by filters
+    occlusion_map: OcclusionMap  # of all measured points
+    is_filtered_out: Callable[[Array], BoolArray]  # positions (S, 3) removed by filters
     end_anchors: Sequence[ObservedObjectEnd] = ()  # ends of the object that were seen
 
     @cached_property
@@ -140,16 +140,11 @@ class ProcessedFrameCloud:
 
     @cached_property
     def _point_spacing(self) -> float:
-        if len(self.points) < 2:
-            return math.inf
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
     def _is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Mask (S,) of the positions (S, 3) that are hidden from the camera or in a region that the filters remove."""
-        hidden = np.zeros(len(places), bool)
-        if self.occlusion_map is not None:
-            hidden |= self.occlusion_map.occluded_position_mask(places, radius, margin)
-        return hidden if self.is_filtered_out is None else hidden | self.is_filtered_out(places)
+        return self.occlusion_map.occluded_position_mask(places, radius, margin) | self.is_filtered_out(places)
 
 
 def fit_quality_and_point_classes(

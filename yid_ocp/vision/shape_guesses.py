@@ -76,17 +76,14 @@ class _Centerline:
 
 
 def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Compute the centerline of the object in a cloud: a tree of nodes, and positions of loops. Empty for few points.
+    """Compute the centerline of the object in a cloud: a tree of nodes, and positions of loops.
 
     `diameter` [m] is the diameter of the thickest tube. Parts of the cloud more than `gap` [m] apart are not connected.
     """
     points = cloud.points
     if len(points) > _MAX_CLOUD_POINTS:
         points = points[np.sort(rng.choice(len(points), _MAX_CLOUD_POINTS, replace=False))]
-    if len(points) > _N_NEIGHBOURS:
-        points, graph = _connected(points, gap)
-    if len(points) <= _N_NEIGHBOURS:
-        return _Centerline(np.empty((0, 3)), np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), diameter)
+    points, graph = _connected(points, gap)
     far = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
     away = np.asarray(dijkstra(graph, directed=False, indices=far))
     width = max(diameter, 2.0 * float(np.median(graph.data)))
