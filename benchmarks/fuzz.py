@@ -123,9 +123,8 @@ def originals(folder: Path) -> None:
     rows += [",".join(f"{value:.6g}" for value in (0.01 * i, *np.sin(np.arange(7) + 0.1 * i))) for i in range(40)]
     (folder / "table.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     cloud = np.random.default_rng(0).normal((0.0, 0.0, 2.0), size=(30, 3))
-    write_frame_folder(
-        FrameSequence.from_clouds([0.1, 0.2], [cloud, cloud], look_at_pose([2, 0, 0], [0, 0, 0])), folder / "frames"
-    )
+    pose = look_at_pose([2, 0, 0], [0, 0, 0])
+    write_frame_folder(FrameSequence(np.array([0.1, 0.2]), ("a", "b"), pose, lambda i: cloud), folder / "frames")
     write_bag(folder / "bag")
     write_dataset(folder / "arm")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from baxter import baxter_foam_y_system
+from smooth_rods import frames_of
 
 from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, Recording
@@ -41,7 +42,7 @@ def main() -> None:
         cloud = cloud.select(statistical_inlier_mask(cloud))
         cloud = cloud.select(~robot.within_surface_distance_mask(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
-    vision.write_frame_folder(vision.FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
+    vision.write_frame_folder(frames_of(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven
     every = slice(None, None, 2)
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)

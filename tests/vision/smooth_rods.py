@@ -118,6 +118,12 @@ def floor_and_wall():
     return [box([1.0, 0.0, -0.94], [8.0, 8.0, 0.02]), box([-1.2, 0.0, 0.5], [0.02, 8.0, 3.0])]
 
 
+def frames_of(t, clouds, pose):
+    """A sequence of clouds in the camera's frame, with their stamps."""
+    names = tuple(f"frame {i}" for i in range(len(clouds)))
+    return vision.FrameSequence(np.asarray(t, float), names, pose, clouds.__getitem__)
+
+
 def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, background=True, still=None):
     """A sequence with its truth: tips of every frame, each (3, 3) in the order w_T1, w_T2, w_T3 [m]."""
     pose = vision.look_at_pose(EYE, TARGET)
@@ -127,7 +133,7 @@ def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, b
         around = floor_and_wall() if background else []
         clouds.append(seen([*meshes, *around, *things(k)], [seed, k]))
         truth.append([tips[name] for name in ("w_T1", "w_T2", "w_T3")])
-    return vision.FrameSequence.from_clouds(np.arange(frames) / rate, clouds, pose), np.array(truth)
+    return frames_of(np.arange(frames) / rate, clouds, pose), np.array(truth)
 
 
 def measured(alone, sequence, truth, extra=(), empty=None, **options):

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wall, measured, pole, seen
+from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wall, frames_of, measured, pole, seen
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at_pose
+from yid_ocp.vision import CloudFilterOptions, ExtraMesh, look_at_pose
 from yid_ocp.vision.point_cloud import wanted_colour_mask
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, foreign_clusters_to_objects
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
@@ -43,7 +43,7 @@ def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):
     assert thing.frames == FRAMES
     assert "track.options.background_estimation: frames" in thing.text
     clouds = [seen([*floor_and_wall(), box(*TABLE)], [9, k]) for k in range(2)]
-    empty = FrameSequence.from_clouds([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
+    empty = frames_of([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
     mesh = ExtraMesh(box_size=TABLE[1], xyz=TABLE[0])
     for how in ({"background_estimation": "frames"}, {"extra": [mesh]}, {"empty": empty}):
         found, error = measured(alone, *table, filters=COARSE, **how)

@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from smooth_rods import frames_of
 
 from yid_ocp.errors import DataError
 from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose, write_frame_folder
@@ -19,9 +20,9 @@ POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 
 @pytest.fixture
 def folder(tmp_path):
-    write_frame_folder(FrameSequence.from_clouds([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
+    write_frame_folder(frames_of([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
     with pytest.raises(DataError, match=r"no points(.|\n)*frame 0"):
-        write_frame_folder(FrameSequence.from_clouds([0.5], [CLOUD[:0]], POSE), tmp_path / "empty")
+        write_frame_folder(frames_of([0.5], [CLOUD[:0]], POSE), tmp_path / "empty")
     return tmp_path / "sequence"
 
 
@@ -218,7 +219,7 @@ SOUND = {
 def read(tmp_path_factory):
     """The points of a file with some bytes."""
     folder = tmp_path_factory.mktemp("frames")
-    write_frame_folder(FrameSequence.from_clouds([0.0], [VERTICES], np.eye(4)), folder)
+    write_frame_folder(frames_of([0.0], [VERTICES], np.eye(4)), folder)
     sequence = read_frames(folder)
 
     def points(data):

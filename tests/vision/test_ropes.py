@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from smooth_rods import frames_of
 
 from yid_ocp import vision
 from yid_ocp.cli import main
@@ -12,7 +13,7 @@ from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import FrameSequence, SceneDescription, TrackOptions, look_at_pose
+from yid_ocp.vision import SceneDescription, TrackOptions, look_at_pose
 from yid_ocp.vision.frame_selection import is_shape_self_touching
 from yid_ocp.vision.track import track_object
 
@@ -59,7 +60,7 @@ def seen(places, pose, rng, count=3500, noise=MILLIMETRE):
 def film(lines, pose, **how):
     rng = np.random.default_rng(7)
     clouds = [seen(places, pose, rng, **how) for places in lines]
-    return FrameSequence.from_clouds(0.2 * np.arange(len(lines)), clouds, pose)
+    return frames_of(0.2 * np.arange(len(lines)), clouds, pose)
 
 
 def snake(k):
@@ -147,7 +148,7 @@ def test_branches_tell_where_the_root_is():
         counts = (1600, 1200, 800)
         clouds.append(np.concatenate([seen(p, TABLE, rng, count=n) for p, n in zip(parts, counts, strict=True)]))
         truth.append([stem[0], *(part[-1] for part in parts)])
-    frames = FrameSequence.from_clouds(np.arange(3.0), clouds, TABLE)
+    frames = frames_of(np.arange(3.0), clouds, TABLE)
     found = track_object(SceneDescription(system), None, frames, OPTIONS)
     assert np.linalg.norm(found.position - truth, axis=2).max() < 4 * MILLIMETRE
     assert "lengths and branches" in found.root_note

@@ -210,5 +210,3 @@ def test_a_recording_that_does_not_fit(system, small, urdf_folder):
         track_object(SceneDescription(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
     with pytest.raises(ModelError, match="no visual shapes"):
         track_object(SceneDescription(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
-    with pytest.raises(DataError, match="pose of the camera is missing"):
-        vision.FrameSequence.from_clouds([0.0], [small.clouds[0]], None)

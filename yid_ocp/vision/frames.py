@@ -17,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from types import ModuleType
@@ -171,13 +171,6 @@ class FrameSequence:
 
     def __len__(self) -> int:
         return len(self.frame_names)
-
-    @staticmethod
-    def from_clouds(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike) -> FrameSequence:
-        """Make a frame sequence from clouds (N, 3) [m] in the camera's frame, with stamps `t` (M,) [s]."""
-        arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
-        names = tuple(f"frame {i}" for i in range(len(arrays)))
-        return FrameSequence(np.asarray(t, float), names, validated_camera_pose(pose, "sequence"), arrays.__getitem__)
 
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:

@@ -123,7 +123,7 @@ class SingleFrameTracker:
         self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
         # a root to be found needs no recorded joints
         known = () if anywhere else self.shape_fitter.recorded_joint_names
-        self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
+        self.joint_time_span, self.joint_angles_at = _joint_angles(recording, known)
         tree = system.mechanism_with_values(values)
         meshes = surface_meshes.extra_meshes_by_joint_index(scene.surfaces_missing_from_urdf, tree)
         if scene.robot_urdf is not None:
@@ -457,7 +457,7 @@ def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str,
 
 
 def _joint_angles(
-    system: System, recording: Recording | None, known: Sequence[str]
+    recording: Recording | None, known: Sequence[str]
 ) -> tuple[tuple[float, float] | None, Callable[[float], Array] | None]:
     """Time span of the joints and their angles in the order of `known`; None without a robot."""
     if not known:

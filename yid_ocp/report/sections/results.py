@@ -102,12 +102,11 @@ def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
 def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
     formats, result = ("yid-history/1", "yid-overlay/1"), findings.result
     result = result if result.get("format") in formats else result.get("history") or {}
-    rows = []
-    if result.get("format") in formats:
-        for name, entry in result["parameters"].items():
-            known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
-            rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in known.items()}))
-    runs = dict.fromkeys(run for entry in result.get("parameters", {}).values() for run in entry["values"])
+    rows, parameters = [], result.get("parameters", {})
+    for name, entry in parameters.items():
+        known = {r: own for r, own in entry["values"].items() if own.get("verdict") != "not_identifiable"}
+        rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in known.items()}))
+    runs = dict.fromkeys(run for entry in parameters.values() for run in entry["values"])
     colors = dict(zip(runs, itertools.cycle(figures.LINE_PALETTE), strict=False))
     return draw_figure_per_unit(rows, partial(figures.parameter_values_by_source_figure, colors=colors))
 
