@@ -40,7 +40,8 @@ from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.files import write_strict_json
 from yid_ocp.integrator import compiled
-from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
+from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.parallel.threads_and_processes import process_pool
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, fit_problem

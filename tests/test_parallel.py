@@ -24,15 +24,14 @@ from yid_ocp.parallel import (
     Task,
     TaskResult,
     WorkerConfig,
-    available_processor_count,
     call_merged_with_other_threads,
     map_in_threads,
     map_with_merged_calls,
-    process_pool,
     require_task_values,
     run_tasks,
 )
 from yid_ocp.parallel import resumable_tasks as parallel_tasks
+from yid_ocp.parallel.threads_and_processes import available_processor_count, process_pool
 from yid_ocp.version import software_fingerprint
 
 

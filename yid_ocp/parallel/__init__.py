@@ -11,8 +11,6 @@ from yid_ocp.parallel.threads_and_processes import CASADI_LOCK as CASADI_LOCK
 from yid_ocp.parallel.threads_and_processes import CasadiLockedCache as CasadiLockedCache
 from yid_ocp.parallel.threads_and_processes import CasadiLockedProperty as CasadiLockedProperty
 from yid_ocp.parallel.threads_and_processes import InlineExecutor as InlineExecutor
-from yid_ocp.parallel.threads_and_processes import available_processor_count as available_processor_count
 from yid_ocp.parallel.threads_and_processes import call_merged_with_other_threads as call_merged_with_other_threads
 from yid_ocp.parallel.threads_and_processes import map_in_threads as map_in_threads
 from yid_ocp.parallel.threads_and_processes import map_with_merged_calls as map_with_merged_calls
-from yid_ocp.parallel.threads_and_processes import process_pool as process_pool
