@@ -180,10 +180,10 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
 
 def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
-    section = discrimination_plan_settings([[pair(label) for label in PAIR]], folder)
+    section = discrimination_plan_settings([[pair(label) for label in PAIR]], str(folder))
     found = {"effects_to_discriminate": list(PAIR), "parameter_run_folder": str(folder)}
     assert section == {"goal": "information", **found}
-    assert discrimination_plan_settings([], folder) is None
+    assert discrimination_plan_settings([], str(folder)) is None
     result = {"summary": "", "verdict": "unknown", "next_plan": section, "seconds": {}, "which": []}
     result |= {"format": "yid-diagnosis/2", "unused_efforts": False, "gap": {"before": {"rmse": {}, "unit": {}}}}
     lines = summary_terminal_lines(summary_blocks(result))

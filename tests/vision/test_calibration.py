@@ -249,6 +249,7 @@ def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
     before = np.zeros(3)
     for shift, turn in ((0.0, 0.0), (0.03, 2.0)):
         found, true = found_of(robot, 7, shift=shift, turn=turn, fix_pose=True, frames=4)
+        assert np.array_equal(found.camera_state.pose, found.prior_state.pose)
         assert found.camera_state.depth_scale == 1.0
         assert ("by the fixed pose" in found.message) == (shift > 0)
         assert np.abs(displaced(found, true)[1]).max() < 3

@@ -179,9 +179,10 @@ class ArmBasedCameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """The result of a camera calibration: camera state, covariance and visibility of the arm."""
+    """The result of a camera calibration: camera state, covariance, prior and visibility of the arm."""
 
     camera_state: CameraState  # pose, depth and clock that the tracking uses
+    prior_state: CameraState  # specified pose, depth and clock
     usual_square_distance: float | None  # misfit of single frames [m^2]; None if no clock was compared
     # (10, 10), of `camera_state`, in the order of `CameraState.state_increment_from`; zero if nothing was estimated
     state_covariance: Array
@@ -215,9 +216,10 @@ class CameraCalibration:
 def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str) -> CameraCalibration:
     """Return a calibration with the specified pose and clock offset. `reason` says why nothing was estimated."""
     offset = options.initial_stamp_minus_joint_time
-    known = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
+    text = f"The camera's pose and its clock offset of {1e3 * offset:.0f} ms are as specified"
+    text += f" (not estimated, because {reason})"
     state, zero = CameraState(pose, clock_offset=offset), np.zeros(CAMERA_STATE_SIZE)
-    return CameraCalibration(state, None, np.diag(zero), zero, None, 0, f"{known} (not estimated, because {reason})")
+    return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
 
 def calibrate_camera(
@@ -311,7 +313,7 @@ class _Calibrator:
         words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
         coverage = f"{100 * presence.there:.0f} % of the arm is seen"
         words += f". These values are from {len(chosen)} images, in which {coverage}."
-        return CameraCalibration(used_state, usual, covariance, beside, presence, len(chosen), words)
+        return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
 
     def _about_the_arm(self, glimpse: StampedCloud) -> StampedCloud | None:
         """The frame's points around the arm, according to the specified state; None if the arm is out of view."""

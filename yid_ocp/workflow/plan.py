@@ -235,12 +235,10 @@ def _information_plan_result(found: InformativeMotionPlan) -> dict[str, Any]:
     }
 
 
-def discrimination_plan_settings(
-    confusable: Sequence[Sequence[Mapping[str, str]]], folder: str | Path
-) -> dict[str, Any] | None:
-    """Return settings of `plan` for a motion that distinguishes the first confusable effects. None without any."""
+def discrimination_plan_settings(confusable: Sequence[Sequence[Mapping[str, str]]], path: str) -> dict[str, Any] | None:
+    """Return settings of `plan` that distinguish the first confusable effects of the run at `path`. None without any."""
     if not confusable:
         return None
     labels = [effect_entry_label(entry) for entry in confusable[0]]
     asked = {"goal": "information", "effects_to_discriminate": labels[:_MAX_DISCRIMINATED_EFFECTS]}
-    return asked | {"parameter_run_folder": str(folder)}
+    return asked | {"parameter_run_folder": path}
