@@ -1,8 +1,8 @@
 """Small systems that together use every feature of a step, and effects that bring these features in."""
 
 import ctypes
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import SimpleNamespace
 
@@ -25,18 +25,14 @@ from yid_ocp.model import (
 )
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import EffectStepTerms, ForceWithFactoredDerivatives, six_joint_floating_mechanism
+from yid_ocp.model.system import Effect, EffectStepTerms, ForceWithFactoredDerivatives, six_joint_floating_mechanism
 from yid_ocp.model.urdf import read_urdf
 
 
 @dataclass(frozen=True)
-class Added:
-    """An effect made of functions; `internal_coordinate_symbols` names its coordinates without momentum."""
+class Added(Effect):
+    """An effect made of functions."""
 
-    kind: str
-    location: str
-    parameters: Parameters
-    internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
     change: Callable = lambda effect, system: system
     add: Callable = lambda effect, state: EffectStepTerms()
 
@@ -45,9 +41,6 @@ class Added:
 
     def step_terms(self, state):
         return self.add(self, state)
-
-    def reading_from_true_value(self, channel, output, state):
-        return output
 
 
 def _parameters(kind, location, **values):
