@@ -138,7 +138,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     near = " ".join(
         told("yid-solve/1", solved(fit=BAD | {"chi2_per_dof": 16.0}, parameters={"a": parameter("not_trusted")}))
     )
-    assert "check the stated noise (is it 4 times as large?) and run `yid-ocp diagnose`" in near
+    assert "check the stated noise (is the true noise 4 times as large?) and run `yid-ocp diagnose`" in near
     lines = told("yid-solve/1", said)
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
     sure = "Until then, take these values as rough: a. Their ± takes the model's error as random."

@@ -24,7 +24,7 @@ _FEW_KINDS = 3  # most kinds of effects tried for which they are named, because 
 _IMMOVABLE_LOCATIONS = {"world", "clock", "camera", "object", "base"}  # locations that do not move by themselves
 _LONGER_SEARCH = "To try the rest, remove diagnosis.budget, or raise it."
 _ORIGIN_TEXTS = {
-    "plant": "the mechanics (forces, stiffnesses, masses), not a sensor",
+    "plant": "the mechanics (forces, stiffnesses, masses) or a recorded torque or angle that moves the model",
     "sensor": "a sensor, not the mechanics",
     "either": "the mechanics or the effort sensor (recorded efforts alone do not show which)",
 }

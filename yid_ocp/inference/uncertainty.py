@@ -503,7 +503,7 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
     said = f"Do not use the values yet, because the model does not explain the recordings ({size})."
     checks = "check units, signs, names and noise and " * (chi2_per_dof * fraction**2 > HOPELESS_CHI2)
     if fraction == 1 and chi2_per_dof <= _POSSIBLE_NOISE_CHI2:
-        checks = f"check the stated noise (is it {chi2_per_dof**0.5:.2g} times as large?) and "
+        checks = f"check the stated noise (is the true noise {chi2_per_dof**0.5:.2g} times as large?) and "
     return f"{said} To find the cause, {checks}run `yid-ocp diagnose`." if with_advice else said
 
 

@@ -277,7 +277,7 @@ class _Calibrator:
     def run(self, frames: Sequence[StampedCloud]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _MIN_FRAMES:
-            needed = f"the arm is in view in {len(glimpses)} of {len(frames)} frames ({_MIN_FRAMES} are needed)"
+            needed = f"the arm is in view in {len(glimpses)} of {len(frames)} frames, but {_MIN_FRAMES} are needed"
             turn = "turn the camera so that it sees the arm, or " * (len(glimpses) < len(frames))
             raise _UntoldError(needed, f"{turn}record for longer")
         state, chosen = self._start(glimpses), glimpses
