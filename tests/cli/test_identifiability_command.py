@@ -120,7 +120,7 @@ def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carri
     done = carried_out(command, pendulum, settings=settings)
     doubt, _, text = " ".join(done.out.split()).partition("Do not use the values yet, because the model ")
     assert text.partition(" First follow the advice on the issues.")[0].endswith("; noise alone gives 1).")
-    assert not doubt or doubt.startswith("Use no value of a fit yet, because of these issues: a channel has more ")
+    assert not doubt or doubt.startswith("Use no value of a fit yet, because a channel has more ")
     assert "in doubt" in done.out
     result = done.result
     own = result["methods"]["gauss_newton"] if command == "compare" else result

@@ -133,10 +133,10 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         options = [*advised_options((first, *others)).values()]
         do = first["advice"] + (f" by {'these options' if len(options) > 1 else 'this option'}:" if options else ".")
         example = f" at {first['where']}," * any(own["what"] != first["what"] for own in others)
-        text = f"{where} (error: {first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
+        text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
         advice += [text, CodeBlock("\n".join(options))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
-        yield SummaryStatement(f"Use no value of a fit yet, because of these issues: {severe}.", "verdict")
+        yield SummaryStatement(f"Use no value of a fit yet, because {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
         do = "Also" if result.get("verdict") == "unknown" else "Before you use values, also"
         yield f"{do} follow the advice below on these issues: {mild}."
