@@ -74,8 +74,9 @@ class NonparametricLaw:
         gap = f"error beyond noise{' that the effects leave' * (len(self.model.effects) > 1)} on held-out motions"
         head = f"The error looks like a torque at {self.location} that depends on {words} ({', '.join(sizes)})."
         closed = f"It would remove {100 * self.closure.fraction:.3g} % of the {gap}. No accepted effect describes it."
-        end = " It may come from outside the model, because no law of motion or load predicts it better." * is_over_time
-        return f"{head} {closed}{end} Allow more effects (diagnosis.candidates), or add law.csv to the model."
+        outside = "It may come from outside the model, because no law of motion or load predicts it better."
+        end = outside if is_over_time else "law.csv of the run folder adds it to the model (docs/howto/law.md)."
+        return f"{head} {closed} {end}"
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the law to a dictionary with location, depends_on, table, closure, visited_range and runner_up."""
