@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from smooth_rods import nowhere
 
 from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.shape_evidence import (
@@ -34,10 +35,6 @@ def tube(low=-0.3, high=0.3, radius=RADIUS, wide=1.0, noise=0.002, seed=0):
 def wall(x, y, z, step=0.006):
     across = np.meshgrid(np.arange(*x, step), np.arange(*y, step))
     return np.column_stack([across[0].ravel(), across[1].ravel(), np.full(across[0].size, z)])
-
-
-def nowhere(places):
-    return np.zeros(len(places), bool)
 
 
 def asked(points, behind=None, removed=nowhere):

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from smooth_rods import nowhere
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.system import System
@@ -41,11 +42,6 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
     cloud = cloud + noise * rng.standard_normal(len(cloud))[:, None] * sight / np.linalg.norm(sight, axis=1)[:, None]
     view = SimpleNamespace(occluded_position_mask=nowhere)
     return ProcessedFrameCloud(cloud, np.ones(len(cloud)), np.array(nodes), CAMERA, view, nowhere)
-
-
-def nowhere(places, *_):
-    """No position is hidden or filtered out."""
-    return np.zeros(len(places), bool)
 
 
 @pytest.fixture(scope="module")

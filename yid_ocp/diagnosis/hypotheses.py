@@ -72,8 +72,8 @@ def make_candidate_effects(
         cls = EFFECTS[kind]
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
-            has_place = (cls.candidate_locations or cls.possible_locations)(system)
-            missing = ", ".join(sorted(cls.required_sensors - sensors)) if has_place else ""
+            could = {own for own, _ in candidate_kinds_and_locations(system, {*sensors, *cls.required_sensors})}
+            missing = ", ".join(sorted(cls.required_sensors - sensors)) if kind in could else ""
             what = f"the effect {kind} is not possible for this model" + (f" without {missing}" if missing else "")
             allowed, hint = ", ".join(dict.fromkeys(k for k, _ in possible)), f"remove {kind} from this list"
             raise ConfigError(what, where=where, allowed=allowed, hint=f"record {missing}" if missing else hint)

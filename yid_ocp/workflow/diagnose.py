@@ -114,7 +114,7 @@ def run_diagnose(
         prediction_outputs.write_diagnosis_hdf5(folder.path / "trajectories.h5", finding, predicted)
         if finding.law is not None:
             files.write_text(folder.path / "law.csv", torque_law_tables_csv(finding.law.tables))
-        last, told, near = finding.final_model, finding.to_dict(), os.path.relpath(folder.final_path)
+        last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_pose_point_names and bool(system.driven or system.prescribed)
         x, is_found = last.unknowns, finding.verdict in ("effect", "no_gap")
@@ -124,10 +124,10 @@ def run_diagnose(
             "model": _final_model_to_dict(finding),
             "issues": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
-            "to_use": _texts_of_final_model(finding, near) if is_found else {},
+            "to_use": _texts_of_final_model(finding, os.path.relpath(folder.final_path)) if is_found else {},
             "not_candidates": effect_kinds_by_missing_signals(recordings),
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),
-            "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), near),
+            "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), str(folder.final_path)),
         }
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}

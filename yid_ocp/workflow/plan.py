@@ -236,7 +236,7 @@ def _information_plan_result(found: InformativeMotionPlan) -> dict[str, Any]:
 
 
 def discrimination_plan_settings(confusable: Sequence[Sequence[Mapping[str, str]]], path: str) -> dict[str, Any] | None:
-    """Return settings of `plan` that distinguish first confusable effects of the run at `path`. None without any."""
+    """Return settings of `plan` that distinguish confusable effects of the run at the absolute `path`, if any."""
     if not confusable:
         return None
     labels = [effect_entry_label(entry) for entry in confusable[0]]

@@ -65,7 +65,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         extended = after[channel][0] if changed and channel in after else None
         errors = {_NOMINAL_LABEL: error, _EXTENDED_LABEL: extended, "sensor noise": floor.get(channel)}
         rows.append((channel, shown, {name: (factor * e, None) for name, e in errors.items() if e is not None}))
-    sentences = ["The figure shows rms errors on held-out recordings, and the part of them from noise alone."]
+    sentences = ["The figure shows rms errors on held-out recordings, and the part of them from sensor noise."]
     return "How large the gap is", sentences, _figures_by_model(rows, "held-out error (rms)", _NOMINAL_LABEL)
 
 
