@@ -12,6 +12,7 @@ from placed_frames import numbers, positions
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.effects import make_effect
+from yid_ocp.effects.base import frame_positions
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
@@ -193,6 +194,21 @@ def test_the_paper_y_stands_where_it_should():
     moved = flexible_object(foam_y_segments(), homogeneous_transform(np.eye(3), [0.0, 0.0, 1.0]))
     np.testing.assert_allclose(positions(moved, ["w_T1"])[0], [0, 0, 1.813])
     assert flexible_object(foam_y_segments()).mechanism.joint_names == item.mechanism.joint_names
+
+
+def test_the_mount_of_an_object_turns_about_its_root():
+    """Where the clamp is, `mount.rx` and `mount.ry` turn the rod as the mount's own roll and pitch would."""
+    rod = flexible_object([FlexibleSegment("T1", 0.6, 0.1, 0.02, links=2, clamped_at_base=True)])
+    at, turned, angles = np.array([0.1, 0.2, 0.3]), rod.with_root_rotation_parameters(), (0.04, -0.07)
+    systems = [
+        System.build(objects=[(item, None, homogeneous_transform(rotation_from_rpy(*rpy), at))], gravity=(0, 0, -9.81))
+        for item, rpy in ((rod, (*angles, 0.0)), (turned, (0.0, 0.0, 0.0)))
+    ]
+    values = dict(zip(("mount.rx", "mount.ry"), angles, strict=True))
+    q = np.array([[0.3, -0.2, 0.1, 0.0, 0.2, -0.1]])
+    for frame in ("object_root", "w_T1"):
+        exact, tilted = (frame_positions(s, v, [frame], q) for s, v in zip(systems, ({}, values), strict=True))
+        np.testing.assert_allclose(tilted, exact, atol=1e-15)
 
 
 def test_checked_in_urdf_is_what_the_generator_writes(urdf_folder):

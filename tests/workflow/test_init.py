@@ -21,7 +21,7 @@ from yid_ocp.data import JointGroup, PointGroup, Recording, SensorChannelGroup, 
 from yid_ocp.model.servos_and_springs import MotorKindAndPreset
 from yid_ocp.model.urdf import urdf_path_from_robot_name
 from yid_ocp.problem.recorded_inputs import select_path_cutoff
-from yid_ocp.workflow.build import build_system, free_parameter_names
+from yid_ocp.workflow.build import build_system, free_parameter_names, settings_by_parameter_name
 from yid_ocp.workflow.build_problem import build_problem
 
 RATE = 125.0
@@ -102,6 +102,8 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     free = free_parameter_names(run, system.parameters)
     assert {f"{name}.{axis}" for name in ("m1", "m2") for axis in "xyz"} <= set(free)
     assert run.model.frames["m1"].position_std == pytest.approx(0.005 * LENGTH, rel=0.05)
+    clamp = settings_by_parameter_name(run, system.parameters)["mount.rx"]  # and how straight the clamp is
+    assert (clamp.free, clamp.prior_std) == (True, 0.05)
     text = (bench / "run.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=yid-ocp.schema.json\n")
     jsonschema.validate(YAML(typ="safe").load(text), config_json_schema())

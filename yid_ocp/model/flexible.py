@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NoReturn
 
 import casadi as ca
@@ -23,9 +23,11 @@ from yid_ocp.model.mechanism import (
     Placement,
     numeric_axis_sin_cos_rotation,
     snap_near_integer_entries,
+    symbolic_rotation_from_rpy,
 )
 from yid_ocp.model.parameters import Parameter, Parameters
 
+ROOT_ROTATION_PARAMETERS = ("mount.rx", "mount.ry")
 AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -109,6 +111,17 @@ class FlexibleObject(ReprMixin):
     mechanism: Mechanism
     elastic_joints: tuple[ElasticJoint, ...]
     segment_layouts: tuple[SingleSegmentLayout, ...]
+
+    def with_root_rotation_parameters(self) -> FlexibleObject:
+        """Return a copy with the parameters of `ROOT_ROTATION_PARAMETERS`: angles [rad] about x and y of the root."""
+        text, limit = "rotation of the object about {} of its mount", math.pi / 2
+        angles = [Parameter(p, 0.0, "rad", -limit, limit, text.format(p[-1])) for p in ROOT_ROTATION_PARAMETERS]
+        rotation = symbolic_rotation_from_rpy(*(angle.symbol for angle in angles))
+        frame = Frame(-1, Placement(rotation, ca.SX(3, 1)))
+        mount = Mechanism("mount", (), {"mount": frame}, Parameters(angles))
+        tree = mount.with_attached_mechanism(self.mechanism, "mount")
+        frames = {name: frame for name, frame in tree.frames.items() if name != "mount"}
+        return replace(self, mechanism=replace(tree, frames=frames))
 
     def _summary(self) -> ReprTexts:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism

@@ -28,9 +28,10 @@ from yid_ocp.effects.law import read_torque_law_tables, torque_law_from_tables
 from yid_ocp.errors import ConfigError, DataError, YidError, unknown_name_error_arguments
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System
+from yid_ocp.model.flexible import ROOT_ROTATION_PARAMETERS
 from yid_ocp.model.mechanism import Frame, Placement, rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.mjcf_robot import mjcf_joint_constants
-from yid_ocp.model.objects.base import CableVertices
+from yid_ocp.model.objects.base import CableVertices, ObjectBuilder
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
@@ -76,7 +77,9 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     damping, of_object = _dampings(run, joints)
     item = model.object
     with add_setting_location_to_errors(run, "model", "object"):
-        objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
+        objects = (
+            [] if item is None else [(_built_object(item, of_object, link_division), *item.parent_frame_and_root_pose)]
+        )
     mode = "driven" if are_arm_states_estimated(run) else arms.mode
     check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
@@ -114,6 +117,11 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         [places] = marker_position_values_by_recording(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)
+
+
+def _built_object(item: ObjectBuilder, damping: float, link_division: int) -> FlexibleObject:
+    built = item.build(damping, link_division)
+    return built if item.root_rotation_std == 0 else built.with_root_rotation_parameters()
 
 
 def urdf_reader_arguments(run: RunSettings) -> dict[str, Any]:
@@ -275,8 +283,9 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Return the settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
-    Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.relative_link_mass_std` and the frames'
-    `position_std` come first. Raises `ConfigError` if a name or pattern matches nothing.
+    Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.relative_link_mass_std`, the object's
+    `mount.rotation_std` and the frames' `position_std` come first. Raises `ConfigError` if a name or pattern matches
+    nothing.
     """
     sections = _section_parameter_settings(run, parameters)
     result = dict(sections)
@@ -347,6 +356,8 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
     if run.model.arms.relative_link_mass_std > 0:
         masses = [name for name in parameters.names if name.endswith(f".{_LINK_MASS_PARAMETER}")]
         found |= dict.fromkeys(masses, ParameterSettings(free=True, prior_std=run.model.arms.relative_link_mass_std))
+    if run.model.object is not None and (std := run.model.object.root_rotation_std) > 0:
+        found |= dict.fromkeys(ROOT_ROTATION_PARAMETERS, ParameterSettings(free=True, prior_std=std))
     for frame, said in run.model.frames.items():
         if said.position_std > 0:
             names = [f"{frame}.{axis}" for axis in _AXES]

@@ -42,6 +42,19 @@ class MountSettings:
         return transform_from_xyz_rpy(self.xyz, self.rpy)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ObjectMountSettings(MountSettings):
+    """The mount of an object, whose direction may be uncertain."""
+
+    rotation_std: Annotated[
+        float,
+        Ge(0),
+        OptionInfo(
+            "standard deviation of its angles about x and y; above 0, mount.rx and mount.ry are estimated", "rad"
+        ),
+    ] = 0.0
+
+
 @dataclass(frozen=True)
 class ClampPosePointNames:
     """The names of two measured points that define a clamp's pose: the origin, and a second point on the z axis.
@@ -215,6 +228,11 @@ class ObjectBuilder:
         return None, None
 
     @property
+    def root_rotation_std(self) -> float:
+        """The standard deviation [rad] of the root's angles `ROOT_ROTATION_PARAMETERS`. 0: there are none."""
+        return 0.0
+
+    @property
     def is_root_fixed_in_world(self) -> bool:
         """Whether the object's root is fixed in the world and not to a robot frame or clamp."""
         return False
@@ -275,7 +293,7 @@ class MountedObjectBuilder(ObjectBuilder):
     gravity_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("factor on the weight of the object, not on its inertia")
     ] = 1.0
-    mount: Annotated[MountSettings | None, OptionInfo("pose of the root; default: the world's origin")] = None
+    mount: Annotated[ObjectMountSettings | None, OptionInfo("pose of the root; default: the world's origin")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         return flexible_object(self.segment_definitions(damping, link_division), gravity_fraction=self.gravity_fraction)
@@ -283,6 +301,10 @@ class MountedObjectBuilder(ObjectBuilder):
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
         return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
+
+    @property
+    def root_rotation_std(self) -> float:
+        return 0.0 if self.mount is None else self.mount.rotation_std
 
     @property
     def is_root_fixed_in_world(self) -> bool:

@@ -179,7 +179,9 @@ class _SegmentedObject(MountedObjectBuilder):
     }
 
     kind: Annotated[Literal["segments"], OptionInfo("kind of object")] = "segments"
-    mount: Annotated[base.MountSettings, OptionInfo("pose of the root")] = field(default_factory=base.MountSettings)
+    mount: Annotated[base.ObjectMountSettings, OptionInfo("pose of the root")] = field(
+        default_factory=base.ObjectMountSettings
+    )
     named_segments: Annotated[Mapping[str, _SegmentGeometry], OptionInfo("segments by name, parents first")] = field(
         default_factory=dict
     )
