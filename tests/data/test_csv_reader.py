@@ -144,7 +144,6 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
     "empty cell of a joint": ("t,q_a,q_b\n0,1,1\n1,1,\n", {}, "infinite value, the first of joint 'b' at t = 1 s", ""),
     "clock": ("t,q_a\n1,1\n0,1\n", {}, "from sample 1 to 2", ""),
-    "two units": ("t,q1_deg,q2_rad\n0,1,1\n", {}, "columns of position are in deg, others in rad", ""),
     "unknown unit": ("t,q_a [mrad]\n0,1\n", {}, "not known: q_a .mrad.", ""),
     "force of no link": ("t,force_x,force_y,force_z\n0,1,1,1\n", {}, "not known: force_x", ""),
     "unit of what": (GOOD, {"units": {"angle": "deg"}}, "'angle', which is not the name of a quantity", ""),
@@ -334,6 +333,15 @@ def test_units_in_a_header_convert_and_a_flag_goes_before_them(tmp_path: Path) -
     assert joints_of(recording).position[:, 0] == pytest.approx(np.radians([90, 45]))
     assert recording.points[0].position[0, 0] == pytest.approx([0.1, 0.2, 0.3])
     assert read_any(path, units={"points": "cm"}).points[0].position[0, 0] == pytest.approx([1, 2, 3])
+    # a linear axis beside a joint, and a unit in a name that only `--columns` explains
+    header = "t,lift_position [mm],a_position [deg],lift_velocity [mm/s],a_velocity [deg/s],elbow angle [deg]"
+    path = table(tmp_path, f"{header}\n0,250,90,100,180,45\n1,250,90,100,180,45\n")
+    joints = joints_of(read_any(path, column_meanings={"elbow angle [deg]": "skip"}))
+    both = np.stack([joints.position[0], joints.values_by_channel["velocity"][0]])
+    np.testing.assert_allclose(both, [[0.25, np.pi / 2], [0.1, np.pi]])
+    path = table(tmp_path, "t,elbow angle [deg]\n0,90\n1,45\n")
+    joints = joints_of(read_any(path, column_meanings={"elbow angle [deg]": "position:elbow"}))
+    assert joints.position[:, 0] == pytest.approx(np.radians([90, 45]))
     # a motor's current is no external effort
     assert parse_quantity_units(["A", "ms", "points=CM"]) == {"effort": "A", "t": "ms", "points": "cm"}
     with pytest.raises(DataError, match="allowed: s, ms, us, ns, m, cm, mm, rad, deg, rev, rad/s"):

@@ -34,24 +34,20 @@ _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
 _SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_BY_WORD), key=len, reverse=True))})", re.I)
 
 
-def column_meanings(
-    header: Sequence[str], sensor_components: Sequence[str]
-) -> tuple[list[ColumnMeaning], list[tuple[str, str]]]:
-    """Return the meaning of each column of `header` (None if unclear), and the (quantity, unit) pairs that names state.
+def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[ColumnMeaning], list[str]]:
+    """Return the meaning of each column of `header` (None if unclear), and the unit that its name states (empty: none).
 
     `sensor_components` are components of vectors measured by sensors on a link, such as `force_x`.
     """
     split = [_split_unit(name, sensor_components) for name in header]
     whole = {name.strip().lower() for name, _ in split}
-    meanings, units = list[ColumnMeaning](), dict[tuple[str, str], None]()
-    for name, unit in split:
+    meanings = list[ColumnMeaning]()
+    for name, _ in split:
         meaning = _exact_meaning(name, sensor_components) or _spelled_meaning(name) or _joint_force(name, meanings)
         if meaning is None and set(AXES) <= whole and name.strip().lower() in AXES:
             meaning = name.strip().lower(), "marker"  # a table of one point
         meanings.append(meaning)
-        if meaning and unit and not (meaning[0] in sensor_components and unit in ("N", "N m", "rad/s")):
-            units["points" if meaning[0] in AXES else meaning[0], unit] = None
-    return meanings, list(units)
+    return meanings, [unit for _, unit in split]
 
 
 def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str]:

@@ -53,7 +53,7 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "rad": {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60, "m/s": 1.0},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60, "m/s": 1.0, "mm/s": 1e-3},
     "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "N": 1.0, "A": 1.0, "mA": 1e-3},
 }
 MOTOR_CURRENT_UNITS = ("A", "mA")  # units of `effort` for motor currents

@@ -197,7 +197,8 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
-    meanings, stated = column_meanings(names, _COMPONENTS)
+    meanings, own_units = column_meanings(names, _COMPONENTS)
+    stated = [*dict.fromkeys(own for own in map(_quantity_and_unit, meanings, own_units) if own)]
     if "has_header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
     meanings = [m if m not in meanings[:i] else None for i, m in enumerate(meanings)]  # the first of two equal ones
@@ -299,7 +300,8 @@ def _read_table(
     elif [*columns] == [str(i + 1) for i in range(len(columns))]:  # meanings in the order of the columns
         superfluous = [*columns][len(names) :]  # are refused below
         columns = dict(zip([*names, *superfluous], columns.values(), strict=False))
-    meanings, units = _meanings(names, columns, f"{path}, line {number}")
+    meanings, own_units = _meanings(names, columns, f"{path}, line {number}")
+    units, scales = _units_and_scales([m for m in zip(meanings, own_units, strict=True) if m[0]], options, str(path))
     for line, cells in lines:
         try:
             numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
@@ -307,7 +309,7 @@ def _read_table(
             if not options.skip_bad_lines:
                 raise
             bad[line] = error.what
-    table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
+    table = np.array(numbers).reshape(-1, len(scales)) * scales
     allowed, hint = "one header row, then one row per time", "export the measurements again, with their rows"
     raise_data_error_unless(len(table), "the table has no rows below its header", str(path), allowed, hint)
     n_lines = len(table) + len(bad)
@@ -394,9 +396,8 @@ def column_pattern(key: str) -> re.Pattern[str]:
     return re.compile(re.escape(key).replace(r"\*", "(.*)"))
 
 
-def _meanings(
-    header: Sequence[str], columns: Mapping[str, str], where: str
-) -> tuple[list[ColumnMeaning], dict[str, str]]:
+def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> tuple[list[ColumnMeaning], list[str]]:
+    """Meaning of every column (None: left out), and the unit that its name states (empty: none)."""
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         found = {name: match for name in header if (match := column_pattern(key).fullmatch(name))}
@@ -406,13 +407,8 @@ def _meanings(
             raise DataError(f"there is no column '{key}'", where=where, **said)
         given |= {name: meaning.replace("*", own.group(1)) if "*" in key else meaning for name, own in found.items()}
     meanings, meant = dict[str, ColumnMeaning](), dict[tuple[str, str], str]()
-    by_name, stated = column_meanings(header, _COMPONENTS)
-    units, unknown = dict[str, str](), list[str]()
-    for quantity, unit in stated:
-        both = units.setdefault(quantity, unit), unit
-        if len({base.factor_to_si_by_quantity({quantity: one}, where)[quantity] for one in both}) > 1:
-            what, allowed = f"some columns of {quantity} are in {both[0]}, others in {both[1]}", "one unit per quantity"
-            raise DataError(what, where=where, allowed=allowed, hint="convert lengths to m and angles to rad")
+    by_name, units = column_meanings(header, _COMPONENTS)
+    unknown = list[str]()
     for name, conventional in zip(header, by_name, strict=True):
         own = _given_meaning(name, given[name], where) if name in given else conventional
         if own is None and name and name not in given and name.lower() not in COUNTER_WORDS:
@@ -434,6 +430,28 @@ def _meanings(
         hint = f"name each, as in --columns '{pattern}={meaning}' (or x:POINT, force_x:SENSOR), or '{unknown[-1]}=skip'"
         raise DataError(what, where=where, allowed=f"{_ALLOWED}, and a unit if it is not SI: q_elbow [deg]", hint=hint)
     return list(meanings.values()), units
+
+
+def _quantity_and_unit(meaning: ColumnMeaning, unit: str) -> tuple[str, str] | None:
+    """A column's quantity, in the words of `--units`, and its unit. None if it states none, or a sensor's SI unit."""
+    if meaning is None or not unit or (meaning[0] in _COMPONENTS and unit in ("N", "N m", "rad/s")):
+        return None
+    return "points" if meaning[0] in AXES else meaning[0], unit
+
+
+def _units_and_scales(
+    columns: Sequence[tuple[ColumnMeaning, str]], options: _CsvOptions, where: str
+) -> tuple[dict[str, str], list[float]]:
+    """The first unit that a column of each quantity states, and the factor from every column's own unit to that one."""
+    units, scales = dict[str, str](), list[float]()
+    for meaning, unit in columns:
+        stated, scale = _quantity_and_unit(meaning, unit), 1.0
+        if stated and stated[0] not in (options.units or {}):
+            first = units.setdefault(*stated)
+            own, of_first = (base.factor_to_si_by_quantity({stated[0]: u}, where)[stated[0]] for u in (unit, first))
+            scale = own / of_first
+        scales.append(scale)
+    return units, scales
 
 
 def _given_meaning(column: str, given: str, where: str) -> ColumnMeaning:
