@@ -282,6 +282,8 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
     assert "0.4 N m s/rad  of pitch, as the robot file states" in (told := capsys.readouterr().out)
     assert told.count("find friction and payload of the arm too, set sensors.joints.effort.use: true") == 2
+    weak = replace(stated.joints, effort=0.01 * np.asarray(stated.joints.effort))  # less than the limit's error
+    assert max(proposed(replace(stated, joints=weak)).sensors["joints.effort"].bias_std.values()) < 0.2
 
 
 def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:

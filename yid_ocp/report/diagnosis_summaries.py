@@ -425,11 +425,12 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
         text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
     yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
-    symbols = {name.rpartition(".")[2]: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
-    constants: TableRows = [("joint", *symbols.values())]
+    words = {name: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
+    columns = dict.fromkeys(words.values())  # a prismatic joint has units, and so columns, of its own
+    constants: TableRows = [("joint", *columns)]
     for joint in result["joints"]:
-        known = {n.rpartition(".")[2]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
-        constants.append((joint, *(known.get(symbol, "") for symbol in symbols)))
+        known = {words[n]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
+        constants.append((joint, *(known.get(column, "") for column in columns)))
     yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
     yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]

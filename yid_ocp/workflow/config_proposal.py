@@ -47,6 +47,7 @@ _REST_WINDOW = 0.1  # window for speeds [s]; up to twice the sample period of sl
 _MIN_FRICTION_TRAVEL = 0.02  # a joint that turns less than this does not inform its friction [rad]
 _COPIED_COMMAND_RATIO = 1e-6  # relative distance to the measured angles below which commands are copies of them
 _TORQUE_BIAS_FRACTION = 0.01  # default constant torque error, as a fraction of a joint's effort limit
+_MAX_TORQUE_BIAS_FRACTION_OF_LARGEST = 0.2  # limit on it, as a fraction of the joint's largest recorded torque
 _TORQUE_BIAS_FRACTION_OF_LARGEST = 0.05  # the same of its largest recorded torque, where it has no limit
 _MIN_ARM_TRAVEL = 0.1  # joints that together turn less than this do not move [rad]
 _POSITION_STEP_PERCENT = 5  # resolution of places along a segment that stays bent [%]
@@ -248,7 +249,11 @@ def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str
         return {}
     limits = {name: tree.joint(name).effort_limit for name in joints}
     largest = dict(zip(recorded.names, np.nanmax(np.abs(recorded.effort), axis=0).tolist(), strict=True))
-    by_limit = {name: _TORQUE_BIAS_FRACTION * limit for name, limit in limits.items() if 0 < limit < math.inf}
+    by_limit = {
+        name: min(_TORQUE_BIAS_FRACTION * limit, _MAX_TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name])
+        for name, limit in limits.items()
+        if 0 < limit < math.inf
+    }
     return {name: _TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name] for name in joints} | by_limit
 
 

@@ -382,7 +382,7 @@ def _sensors(proposal: ProposedConfigChoices) -> Iterator[tuple[str, list[str], 
             if proposal.torque_bias_std and not proposal.is_identified_from_efforts_only:
                 entries.append(f"bias_std: {_number_or_numbers_by_name(proposal.torque_bias_std)}")
                 said += ". bias_std is the expected constant error of a torque (a guess: 1 % of its limit in the robot "
-                said += "file, else 5 % of the largest recorded one)"
+                said += "file, but at most 20 % of the largest recorded one; without a limit 5 % of it)"
             if proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only:
                 unused = f"false: the object is estimated without torques; true: friction is found, too; {said}"
         is_mounted = places and "." in group
