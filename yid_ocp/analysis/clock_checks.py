@@ -11,7 +11,6 @@ account for correlated errors in blocks of time (Cameron, Gelbach, Miller 2011, 
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -39,7 +38,6 @@ from yid_ocp.solvers import base as solvers
 
 PositionsAtTimesFunction = Callable[[Array], Array]  # N times on the joints' clock (N,) to points (N, np, 3) [m]
 
-log = logging.getLogger(__name__)
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 _MAX_EXPOSURE_TIME = 0.04  # of a sample: a slow camera knows the time of a frame better than its period [s]
@@ -220,10 +218,11 @@ def point_clock_offset_drift_and_rms_error(
 
 
 def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[EstimationProblem, list[Issue]]:
-    """Return the problem with corrected times of points whose clock is uncertain, and an issue for each correction.
+    """Return the problem with corrected times of points whose clock is uncertain, and an issue for large corrections.
 
     A group is corrected if its `clock_offset_std` exceeds half a sample period: the residual is not linear in so large
-    an offset. Fits alternate with shifts of the times to the predicted paths. Held-out recordings are shifted, too.
+    an offset. Fits alternate with shifts of the times to the predicted paths. Held-out recordings are shifted, too. A
+    correction is large above half a sample period.
     """
     recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
     sensors, count, late = problem.options.sensors, len(problem.episodes), dict[tuple[int, str], tuple[float, float]]()
@@ -255,14 +254,15 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
     issues, advice = list[Issue](), "values may be used, as the fit shifts the times. If you know the offset, import "
     advice += "again with --clock-offset FILE=SECONDS"
     for (i, name), (shift, std) in late.items():
-        own, said = recordings[i].name, _lateness_text(shift)
-        words = f"a fit finds time stamps of {name} {said} and corrects them"
-        ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
-        if ratio > 1:
-            words += f". Their clock_offset_std is {1e3 * std:.3g} ms ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)"
-            issues.append(Issue("clock_offset", words, "warning", ratio, advice, own, name, "t"))
-        else:
-            log.warning("recording '%s': %s", own, words)
+        [group] = (own for own in recordings[i].points if own.name == name)
+        if abs(shift) > 0.5 * median_sample_period(group.t):
+            words = (
+                f"a fit finds time stamps of {name} {_lateness_text(shift)} and corrects them. Their clock_offset_std "
+            )
+            words += f"is {1e3 * std:.3g} ms"
+            ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
+            words += f" ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)" if ratio > 1 else ""
+            issues.append(Issue("clock_offset", words, "warning", ratio, advice, recordings[i].name, name, "t"))
     return problem, issues
 
 

@@ -139,7 +139,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         yield SummaryStatement(f"Use no value of a fit yet, because {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
         do = "Also" if result.get("verdict") == "unknown" else "Before you use values, also"
-        yield f"{do} follow the advice below on these issues: {mild}."
+        yield f"{do} read the advice below on these issues: {mild}."
     yield SummaryTable(rows if len(issues) >= _MIN_TABLE_ISSUES else rows[:1], "Issues")
     yield from advice
 
