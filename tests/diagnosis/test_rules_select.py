@@ -220,7 +220,7 @@ class Rounds:
         usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None, "cost": 1.0, "noisy": False}
         vars(self).update(usual | how)
         self.scores = tuple(map(lambda of, p, by: score(of, p=p, decrease=by), EFFECTS, p_values, (19.0, 18.0, 17.0)))
-        self.progress, self.skipped, self.is_late = self.heard, [], False
+        self.progress, self.skipped, self.is_late, self.checked = self.heard, [], False, []
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
 
     def is_skipped_past_deadline(self, *what):
@@ -231,6 +231,9 @@ class Rounds:
         known = "".join(sorted(of.kind for of in effects))
         values = {f"{of.label}.a": 0.0 if of.kind in self.absent else 1.0 for of in effects}
         return fit(effects, loss(*self.losses[known]), self.cost, {"k": float(len(effects)), **values})
+
+    def check_discretisation(self, fit, gap):
+        self.checked.append((round(fit.values["k"]), gap, len(self.refits)))
 
     def screened(self, base=()):
         labels = {of.label for of in base}
@@ -326,6 +329,7 @@ def test_where_a_second_effect_does_not_promise_to_explain_a_gap_nothing_more_is
     _, chosen, _ = rounds.compose()
     assert chosen == ["a"]
     assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
+    assert rounds.checked == [(1, 18.0, 1)], "before that, whether the discretisation explains what the effect leaves"
     assert (len(rounds.refits) > 1) is goes_on
 
 

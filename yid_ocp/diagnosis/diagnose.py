@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import threadpoolctl
@@ -25,6 +26,7 @@ from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, Can
 from yid_ocp.diagnosis.refit import (
     EffectSearchRecord,
     RefitContext,
+    RefitStatistics,
     RefitStore,
     RefittedModel,
     reevaluate_refit_with_all_candidates,
@@ -209,23 +211,35 @@ def _restarted(
 
 def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
     """The nominal model, examined again if noise or discretisation need it beside the effects; else `seen`."""
+    if judged.verdict != "unknown":
+        return seen
     fits = [entry.refitted_model for entry in judged.selected_effects]
     if not fits:
-        gap = seen.evidence.screening.largest_predicted_chi2_decrease
-        return _at_finer_discretisation(seen, seen.nominal, gap, True) if judged.verdict == "unknown" else seen
-    if judged.verdict == "unknown":
-        problem = seen.with_events.with_encoder_noise_in_efforts(fits[-1].effects, fits[-1].values)
-        if problem is not None:
-            beside = hypotheses.join_effect_labels(fits[-1].effects)
-            seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
-            return _restarted(seen, problem, seen.nominal.values, {})
-    fit = fits[-2:][0]  # the last of several effects may correct the error of the discretisation
-    scores = seen.search.record.screenings.get(f"beside {hypotheses.join_effect_labels(fit.effects)}")
-    if scores is None:  # the effects leave only noise
+        return _at_finer_discretisation(
+            seen, seen.nominal, seen.evidence.screening.largest_predicted_chi2_decrease, True
+        )
+    problem = seen.with_events.with_encoder_noise_in_efforts(fits[-1].effects, fits[-1].values)
+    if problem is None:
         return seen
+    beside = hypotheses.join_effect_labels(fits[-1].effects)
+    seen.search.progress.begin_stage(f"starting again with noise beside {beside}")
+    return _restarted(seen, problem, seen.nominal.values, {})
+
+
+class _FinerModelExplainsError(Exception):
+    """A search is obsolete, because a finer discretisation removes what more effects would explain."""
+
+    def __init__(self, examined: _Examined) -> None:
+        super().__init__()
+        self.examined = examined
+
+
+def _check_discretisation(seen: _Examined, fit: RefitStatistics, gap: float) -> None:
+    """Raise `_FinerModelExplainsError` if the discretisation explains what the effects of a fit leave."""
     assert isinstance(fit, RefittedModel)
-    fit = reevaluate_refit_with_all_candidates(seen.search.problem, fit)
-    return _at_finer_discretisation(seen, fit, scores.largest_predicted_chi2_decrease)
+    anew = _at_finer_discretisation(seen, reevaluate_refit_with_all_candidates(seen.search.problem, fit), gap)
+    if anew is not seen:
+        raise _FinerModelExplainsError(anew)
 
 
 def _without_priors_of(problem: AllCandidatesProblem, released: Sequence[str]) -> AllCandidatesProblem:
@@ -346,7 +360,11 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
         shifted = earlier.shifted_parameters_with_prior(nominal, limits)
         evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
-        judged = judge(search, evidence)
+        try:
+            judged = judge(replace(search, check_discretisation=partial(_check_discretisation, seen)), evidence)
+        except _FinerModelExplainsError as found:
+            seen = found.examined
+            continue
         # a search that begins anew would find nothing
         if search.is_skipped_past_deadline(*(f"a change of {name} since the baseline" for name in shifted)):
             break

@@ -129,6 +129,8 @@ class RefitContext:
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)  # likewise
     stage_ends: dict[str, float] = field(default_factory=dict)  # values of `time.perf_counter` by stage, likewise
     rounds: list[tuple[tuple[EffectBase, ...], int]] = field(default_factory=list)  # effects, number of refits
+    # called with the fit of the first effect before others are tried beside it, and with the fall of r'r they promise
+    check_discretisation: Callable[[RefitStatistics, float], object] = lambda fit, gap: None
 
     def record_stage_end_time(self, name: str) -> None:
         """Record that a stage ends now."""

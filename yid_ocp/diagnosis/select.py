@@ -195,6 +195,8 @@ def select_effects(
             break
         search.progress.begin_stage(f"scoring {rest}", 3.0, 13.0)
         seen = search.screen(base, better.values, f"beside {beside}")
+        if len(base) == 1:  # a later effect may correct the error of the discretisation
+            search.check_discretisation(better, seen.largest_predicted_chi2_decrease)
         # what the effects close together with what another one promises in the linear model
         promised = 2 * (nominal.cost - better.cost) + seen.largest_predicted_chi2_decrease
         if promised < limits.min_explained_fraction * max(nominal.excess_chi2, 1.0):
