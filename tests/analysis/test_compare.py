@@ -75,7 +75,7 @@ def test_nothing_to_agree_on(repository, carried_out):
     assert "single_shooting did not converge" in text
     advice = "Set compare.methods.multiple_shooting.max_iterations: 200."
     assert f"multiple_shooting did not converge: IPOPT reached its limit. {advice}" in text
-    assert "Use no value, because these recordings determine no parameter." in text
+    assert "Use 95 % intervals in place of values, because no ± is below 10 %." in text
     values = [entry["parameters"]["spring_1.stiffness"]["value"] for entry in done.result["methods"].values()]
     page = (done.folder / "report.html").read_text(encoding="utf-8").partition("<script")[0]
     assert not [

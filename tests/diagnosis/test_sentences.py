@@ -106,7 +106,9 @@ def places():
         ("mechanics or sensor", {READ_FORCE: 9.0}, {"plant": 9.0, "both": 9.0}),
         ("both", {FORCE: 9.0, BIAS: 9.0}, {"plant": 9.0, "sensor": 9.0, "both": 20.0}),
     ]:
-        yield f"side: {name}", finding("unknown", smoother_result=smoothed(weight, evidence=evidence), **NO_EFFECT)
+        found = {"smoother_result": smoothed(weight, evidence=evidence), **NO_EFFECT}
+        yield f"side: {name}", finding("unknown", **found)
+        yield f"side: {name}, at a camera", finding("unknown", gap_locations=(place("camera"),), **found)
 
 
 def effects():

@@ -226,7 +226,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     weak = solved(parameters={"a": parameter("weak")})
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
     lines = told("yid-compare/1", compared(methods=methods, judged=weak, published={"a": 1.0}))
-    assert any(line.startswith("Use no value, because these recordings determine no parameter.") for line in lines)
+    assert any(line.startswith("Use 95 % intervals in place of values, because no ± is below 10 %.") for line in lines)
     assert line_of(lines, "cost (half the sum of (error/noise)^2)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:9] == ["2", "±", "0.1", "2", "2", "±", "0.1", "1"], "of what failed no ±"
     head = line_of(lines, "parameter")

@@ -197,9 +197,10 @@ def _gap_locations_sentences(result: DiagnosisResult) -> str:
     alike = ([words.get(name, name) for name in (p.location, *p.indistinguishable_from)] for p in where)
     named = [f"{' or '.join(names)} ({100 * p.gap_share:.0f} %)" for p, names in zip(where, alike, strict=True)]
     named += _said((rest >= MIN_GAP_SHARE, f"elsewhere ({100 * rest:.0f} %)"))
-    rivals = {name for p in where if p.indistinguishable_from for name in (p.location, *p.indistinguishable_from)}
-    is_unsure = bool(rivals & {*groups, "camera", "clock"})  # whether a place or a sensor
-    side = _said((origin and not is_unsure, f" Its origin is {origin}."))
+    # the origin is said only if all places are on its side
+    is_sensor = result.smoother_result.plant_or_sensor_origin == "sensor"
+    sides = {name in {*groups, "camera", "clock"} for p in where for name in (p.location, *p.indistinguishable_from)}
+    side = _said((origin and sides == {is_sensor}, f" Its origin is {origin}."))
     return f"The recordings attribute the error beyond noise to {', '.join(named)}.{''.join(side)}"
 
 

@@ -348,6 +348,10 @@ def _samples(
     if not any(s.n_residuals for s in samples):
         what, where = "no sensor of the model has a measurement in the recording", f"recording '{recording.name}'"
         what += ", which has no efforts" * (recording.joints is not None and recording.joints.effort is None)
+        lost = [group.name for group in recording.points if np.isnan(group.position).all()]
+        what += f". All readings of {', '.join(lost)} are missing (NaN)" if lost else ""
+        if options.weighting == "paper":
+            what = "steepest_descent and weighting: paper compare points or efforts only, and the recording has none"
         hint = "record efforts or points; if the file has some, set use: true or frame_by_recorded_name under `sensors`"
         raise DataError(what, where=where, allowed="points on the model's frames, or channels of its joints", hint=hint)
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

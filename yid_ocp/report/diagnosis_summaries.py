@@ -367,7 +367,7 @@ def _objections_to_agreement(result: Mapping[str, Any], methods: Iterable[str], 
     elif not fit["data_trusted"]:
         yield "The recordings have issues, so agreement of methods does not confirm the values."
     elif not any(entry["verdict"] == "identifiable" for entry in judged):
-        yield "Use no value, because these recordings determine no parameter. `yid-ocp identifiability` shows why."
+        yield "Use 95 % intervals in place of values, because no ± is below 10 %. `yid-ocp identifiability` shows why."
     elif not result["agree"] and not result["disturbed"]:
         yield f"Use the column `{best}`. The reasons why other values differ are below."
 
@@ -491,6 +491,8 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
         yield two if len(runs) == 2 else "No single run explains this difference."
+        names = abbreviated_names_text(poor)
+        yield f"First run `yid-ocp diagnose` on {names}, whose recordings the model does not explain." if poor else ""
 
 
 @SUMMARIES.register("yid-overlay/1")
