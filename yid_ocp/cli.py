@@ -290,6 +290,8 @@ COMMANDS = (
 class _Parser(argparse.ArgumentParser):
     """An argument parser that raises `ConfigError` for invalid arguments, with the nearest known name as hint."""
 
+    parsers_by_command: dict[str, _Parser] | None = None  # of all commands, at the parser of a command
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         found, rest = super().parse_known_args(args, namespace)
         if rest:
@@ -301,7 +303,11 @@ class _Parser(argparse.ArgumentParser):
                     what, hint = f"--set {name} has no value", f"write --set {name}=VALUE, without spaces"
                 raise ConfigError(what, where=self.prog, allowed=self._usage(), hint=hint)
             said = unknown_name_error_arguments(flag, flags, self._help())
-            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **said)
+            others = [
+                name for name, own in (self.parsers_by_command or {}).items() if flag in own._option_string_actions
+            ]
+            what = f"there is no option '{flag}'" + (f"; the command {' or '.join(others)} has it" if others else "")
+            raise ConfigError(what, where=self.prog, **said)
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -346,6 +352,7 @@ def build_argument_parser() -> argparse.ArgumentParser:
         added = commands.add_parser(row.name, help=row.help, description=row.help[0].upper() + row.help[1:] + ".")
         row.add_arguments(added)
         added.set_defaults(run=row.run)
+        added.parsers_by_command = commands.choices
     return top
 
 

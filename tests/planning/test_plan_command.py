@@ -173,7 +173,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"{100 * known.std_planned:.2g} %" in words
     assert all(name in words for names in result["limits_reached"].values() for name in names)
-    assert "holds for the configured initial values" in words
+    assert "uses the initial values of the configuration" in words
     result["parameters"] = {name: own | {"verdict": "not_identifiable"} for name, own in result["parameters"].items()}
     assert summary_terminal_lines(summary_blocks(result))[0].startswith("Do not use this ")
 

@@ -181,7 +181,7 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
     places = {name: said.parent_frame for name, said in load_config("cable.yaml").model.frames.items()}
     assert places == {"middle": "cable:50%", "tip": "w_cable"}
     problem = load_problem("cable.yaml", ["problem.use_compiler=false"])
-    where = {f"{name}.{axis}": 0.0 for name in places for axis in "xyz"}
+    where = {f"{name}.{axis}": 0.0 for name in places for axis in "xyz"} | {"mount.rx": 0.0, "mount.ry": 0.0}
     assert set(problem.free) == {*UR5.truth, *where}
     at_truth = problem.evaluate(problem.pack_unknowns(UR5.truth | where), derivatives=False)
     count = sum(len(group.t) * 3 * len(group.names) for group in recording.points)

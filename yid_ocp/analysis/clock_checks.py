@@ -165,17 +165,18 @@ def robot_held_point_clock_issues(
 
 def _drift_issue(found: _ClockError, group: str, limit: float, severity: IssueSeverity, can_omit: bool = True) -> Issue:
     late, drift, whole = found.delay, found.drift, found.whole_drift
-    begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
-    size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
-    words = f"time stamps of {group} are {begin} off the joints' clock at the beginning and {end} at the end "
-    words += f"(a change by {1e3 * limit:.3g} ms is tolerated). Their clock runs {size} parts per thousand too {how}"
+    begin, end = (_lateness_text(late + sign * 0.5 * whole) for sign in (-1, 1))
+    size, how = f"{100 * abs(drift):.2g} ± {100 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
+    words = f"time stamps of {group} are {begin} at the beginning and {end} at the end, on the joints' clock "
+    words += f"(a change by {1e3 * limit:.3g} ms is tolerated). Their clock runs {size} % too {how}"
     advice = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)) + ", or leave the points out" * can_omit
     setting = f"sensors.{group}.use: false" * can_omit
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
 def _lateness_text(late: float) -> str:
-    return f"{1e3 * abs(late):.3g} ms {'late' if late > 0 else 'early'}"
+    size = f"{abs(late):.3g} s" if abs(late) >= 1 else f"{1e3 * abs(late):.3g} ms"
+    return f"{size} {'late' if late > 0 else 'early'}"
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:

@@ -158,7 +158,7 @@ def _changed_times(
         return
     late, drift, error = clock_checks.point_clock_offset_drift_and_rms_error(path, knots, t, seen, drifts=True)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
-        words = f"if their clock is corrected by {-late:+.3g} s and {-1e3 * drift:+.3g} parts per thousand"
+        words = f"if their clock is corrected by {-late:+.3g} s and {-100 * drift:+.3g} %"
         yield _Change("clock_drift", words, clock_checks.timestamp_correction_advice(late, drift, middle), error)
 
 

@@ -331,7 +331,7 @@ class _Reader:
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s.,].*)", raw)):
             given = match[2].strip()
             factor = _FACTORS.get((given, unit), float(given == unit)) * (match[1].count(".") < 2)
-            number = f"{float(match[1]) * factor:.6g}" if factor else f"the number, converted from {given},"
+            number = f"{float(match[1]) * factor:.6g}" if factor else "the number"
             advice = f"write {number} alone, without a unit" + f": it is in {unit}" * bool(unit)
         kinds = [own for own in map(options.variadic_tuple_entry_type, options.non_none_union_members(hint)) if own]
         are_sections = any(schema.section_variants_from_annotation(kind) is not None for kind in kinds)

@@ -564,7 +564,9 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
     what, allowed = f"the array has shape {array.shape}, but must have {shape}", f"{letters}, as in recordings.md"
-    hint = "transpose it" if array.shape[::-1] == shape else "write one row for each time and one entry for each name"
+    entries = "write one row for each time, one entry for each name"
+    entries += f", and {shape[-1]} components of each" * (len(shape) > 2)
+    hint = "transpose it" if array.shape[::-1] == shape else entries
     raise_data_error_unless(array.shape == shape, what, where, allowed, hint)
 
 

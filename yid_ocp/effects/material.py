@@ -81,7 +81,7 @@ class _StandardLinearSolid(_SegmentMemory):
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
     declared_parameters = (
-        ParameterDefinition("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness that relaxes over the lasting one"),
+        ParameterDefinition("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "relaxing over lasting stiffness"),
         ParameterDefinition("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "relaxation time", True),
     )
 

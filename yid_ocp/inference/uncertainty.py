@@ -491,8 +491,8 @@ def goodness_of_fit_message(fit: Mapping[str, Any], with_advice: bool = True) ->
         return "It is not known whether the model explains the recordings."
     chi2 = f"{chi2_per_dof:.3g}" if chi2_per_dof < 1000 else f"{chi2_per_dof:.0f}"
     fraction = fit.get("noise_fraction", 1.0)
-    share = f"; diagnosis.noise_fraction_of_stated_std is {fraction:g}" if fraction < 1 else ""
-    size = f"chi2 per degree of freedom is {chi2}; noise alone gives 1{share}"
+    share = f" with {fraction:g} of the stated std (diagnosis.noise_fraction_of_stated_std)" if fraction < 1 else ""
+    size = f"chi2 per degree of freedom is {chi2}; noise alone{share} gives 1"
     if explains and chi2_per_dof > 1 + null_test.DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2_per_dof:
         chance = "" if p_value is None else f", and so much or more in {100 * p_value:.2g} % of cases"
         said = "The errors are larger than noise usually leaves them, so the model may lack a small effect"

@@ -478,7 +478,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
         places = (f" in {first}", f" in {last}") if len(runs) > 2 else ("", "")
         said = f"{name} differs between the runs, from {low:.4g}{places[0]} to {high:.4g} {entry['unit']}{places[1]}"
-        limit = f"limit: {result['level'] / len(result['parameters']):.2g}"
+        limit = f"below {result['level'] / len(result['parameters']):.2g} counts as a difference"
         yield f"{said} (noise alone: p {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         names = " and ".join(wrong)
@@ -490,7 +490,7 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield said
     elif drifted:
         two = "Two runs that differ do not show which one is wrong. Add a third run."
-        yield two if len(runs) == 2 else "No single run explains this difference."
+        yield two if len(runs) == 2 else "The runs differ, whichever one is left out."
         names = abbreviated_names_text(poor)
         yield f"First run `yid-ocp diagnose` on {names}, whose recordings the model does not explain." if poor else ""
 

@@ -54,6 +54,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the matrix A of a step: {radius:.6g})."
+    said += " Growth is usual where torques move an arm, as the model has no controller." if radius > 1 + 1e-6 else ""
     yield SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
     title = "How much a change of a parameter changes the recorded readings"

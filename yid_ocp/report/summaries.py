@@ -469,7 +469,10 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     for words, unobserved in grouped((words, name) for name, words in result["unseen"].items()).items():
         yield f"No motion that was tried lets a sensor observe {', '.join(unobserved)}. For this, {words}."
     yield from (f"This motion leaves open: {words}." for words in result["open"])
-    yield "The forecast holds for the configured initial values." if result["from"]["run"] is None else ""
+    text = (
+        "The forecast uses the initial values of the configuration. For estimates, set plan.parameter_run_folder: RUN."
+    )
+    yield text if result["from"]["run"] is None else ""
 
 
 @SUMMARIES.register("yid-check/1")

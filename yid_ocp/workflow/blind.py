@@ -441,7 +441,8 @@ def _with_simulated_noise(run: RunSettings) -> RunSettings:
     missing = [name for name in run.sensors if first and name.startswith("points") and name not in simulated]
     for name in (own for own in missing if run.sensors[own].use is not False):
         what, allowed = f"a blind test cannot simulate '{name}' of this model", "joints, and points of model.object"
-        hint = f"leave it out (sensors.{name}.use: false), or use a model with an object and a known camera pose"
+        lacks = "an object with measured points" if not system.point_frames else "the pose of a camera"
+        hint = f"leave it out (sensors.{name}.use: false), as the recording or the model lacks {lacks}"
         raise run.config_error(what, "sensors", name, allowed=allowed, hint=hint)
     if not system.driven or system.prescribed:
         what, hint = "a blind test needs arms whose joints are all driven", "set model.arms.mode: driven"

@@ -284,11 +284,11 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     """Return the settings of every parameter that a name or pattern matches. Later keys override earlier ones.
 
     Settings implied by `model.friction`, `model.arms.servo.motor`, `model.arms.relative_link_mass_std`, the object's
-    `mount.rotation_std` and the frames' `position_std` come first. Raises `ConfigError` if a name or pattern matches
-    nothing.
+    `mount.rotation_std` and the frames' `position_std` count if no key overrides them, and stand last. Raises
+    `ConfigError` if a name or pattern matches nothing.
     """
     sections = _section_parameter_settings(run, parameters)
-    result = dict(sections)
+    result: dict[str, ParameterSettings] = {}
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
@@ -300,7 +300,9 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
                 error.hint = f"set model.arms.mode: servo, which has this parameter, or delete parameters.{key}"
             raise error
         said = {name: value for name, value in vars(given).items() if value is not None}
-        result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
+        known = {name: result.get(name, sections.get(name, ParameterSettings())) for name in matches}
+        result |= {name: replace(own, **said) for name, own in known.items()}
+    result |= {name: own for name, own in sections.items() if name not in result}
     # a fixed parameter has the published value without a prior
     fixed = (name for name in sections if not result[name].free)
     return result | {name: replace(result[name], prior_std=None) for name in fixed}

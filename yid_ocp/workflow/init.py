@@ -221,7 +221,8 @@ def _summary_lines(
     for group, own in proposal.point_placements.items() if proposal.has_object else ():
         if "." not in group and own and {place.frame for place in own} <= {"", proposal.holder_frame}:
             frames, use = f"sensors.{group}.frame_by_recorded_name: {{POINT: FRAME}}", f"sensors.{group}.use: false"
-            lost.append(f"warning: no point of the group {group} is on the object. Set {frames} or {use}")
+            said = f"no point of the group {group} is on the object. If its places are right, set {frames} or {use}"
+            lost.append(f"warning: {said}")
     where = f" in the picture {out.with_suffix('.html')}" * has_picture
     head = f"`init` chose these settings. Check them{where}:"
     lines = [*lost, head, *(f"  {text}" for text in lines + told if f"warning: {text}" not in lost)]
