@@ -74,9 +74,10 @@ class SplineMotionExperiment:
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)
         known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
         theta = step.system.parameters.vector(known)
-        first = np.array(episode.initial_known_coordinates)
-        if options.start_joint_positions is not None:
-            first = joint_paths.start_joint_positions_as_array(step.system, options.start_joint_positions)
+        posture = options.start_joint_positions
+        if posture is None:
+            posture = dict(zip(step.system.prescribed, episode.initial_known_coordinates, strict=True))
+        first = joint_paths.start_joint_positions_as_array(step.system, posture)
         path = joint_paths.RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
         mover = joint_paths.PathSimulator(
             step, theta, joint_paths.solve_start_equilibrium(step, theta, first), path, options.hold_duration
