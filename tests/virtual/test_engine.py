@@ -153,9 +153,7 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
 
 def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoModelAndState:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
-    scene = MujocoModelAndState.from_compiled_model(
-        system, mujoco, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step))
-    )
+    scene = MujocoModelAndState(system, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step)))
     scene.data.qpos[:] = scene.model.qpos_spring
     for name, angle in grasping_joint_angles(held, TRUTH).items():
         scene.data.qpos[scene.model.joint(name).id] = angle + 0.1

@@ -94,7 +94,7 @@ def plan_informative_motion(
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_parameter_names))
     shapes = {name: e.parameters[name].value for e in rivals for name in e.shape_parameter_names}
-    experiment = SplineMotionExperiment.from_options(composed, known | shapes, options, names)
+    experiment = SplineMotionExperiment(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionEvaluator(system, system.point_frames)
     limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
