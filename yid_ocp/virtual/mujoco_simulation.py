@@ -171,16 +171,16 @@ def simulate_in_mujoco(
         start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-        controller: TrackingController | _ServoCommander
         if system.servos:
-            controller = _ServoCommander(scene, motion)
-            _settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
+            control = _servo_command_function(scene, motion)
+            _settle_under_servo_commands(scene, nominal_damping, control(0.0))
         else:
-            controller = TrackingController(scene, motion, settle_and_return_holding_torques(scene, nominal_damping))
+            balance = settle_and_return_holding_torques(scene, nominal_damping)
+            control = TrackingController(scene, motion, balance).apply_and_return_control_input
         if injected is not None:
             injected.begin_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
-        result = _play(scene, controller, chosen, frames)
+        result = _play(scene, control, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
         hint = f"pass a time_step below {chosen.time_step:g} s, or a slower motion"
@@ -283,17 +283,15 @@ class TrackingController:
         return np.array(shadow.qfrc_inverse[driven])
 
 
-class _ServoCommander:
-    """Controller that commands position servos along a motion, relative to the joint angles at its creation."""
+def _servo_command_function(scene: MujocoModelAndState, motion: JointOffsetMotion) -> Callable[[float], Array]:
+    """Function of time that commands position servos along a motion from the present angles, and returns commands."""
+    start = scene.data.qpos[scene.moved_joint_ids].copy()
 
-    def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion) -> None:
-        self._scene, self._motion = scene, motion
-        self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
+    def control(t: float) -> Array:
+        scene.data.ctrl[:] = commands = start + motion.offset_and_derivatives(t)[0]
+        return np.asarray(commands)
 
-    def apply_and_return_control_input(self, t: float) -> Array:
-        commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
-        self._scene.data.ctrl[:] = commands
-        return commands
+    return control
 
 
 def _initialize_actuator_history(scene: MujocoModelAndState, commands: Array) -> None:
@@ -350,12 +348,12 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
 
 
 def _play(
-    scene: MujocoModelAndState,
-    controller: TrackingController | _ServoCommander,
-    simulation: SimulationOptions,
-    frames: IntArray,
+    scene: MujocoModelAndState, control: Callable[[float], Array], simulation: SimulationOptions, frames: IntArray
 ) -> SimulationResult:
-    """Simulate one controller period after another, with constant inputs in each. `frames`: steps of camera frames."""
+    """Simulate one controller period after another, with constant inputs in each. `frames`: steps of camera frames.
+
+    `control(t)` applies and returns the inputs from time t [s] on.
+    """
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     periods, ticks = simulation.controller_periods_per_sample, simulation._tick_steps()
     steps_per_second = simulation._steps_per_period * periods * simulation.sample_rate
@@ -363,7 +361,7 @@ def _play(
     for tick, done in enumerate(ticks.tolist()):
         end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_and_return_control_input(done / steps_per_second))
+        torques.append(control(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])

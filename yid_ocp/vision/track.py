@@ -133,7 +133,7 @@ class SingleFrameTracker:
             hint = "leave track.options.filters.object_colours out, or record clouds with colours"
             raise DataError("the clouds have no colours", where=sequence.source, allowed="coloured clouds", hint=hint)
         self._asked = _spread(usable, _MAX_SIZED_FRAMES)
-        self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
+        self._shapes: dict[tuple[float, ...], ShapeFitter] = {}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
     def _configuration_at_rest(self, t: float) -> Array:
@@ -212,10 +212,9 @@ class SingleFrameTracker:
 
     def _shape(self, sizes: sequence_calibration.TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
-        used = sizes.estimated_dimension_mask
-        key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
+        values = sizes.parameters_with_fitted_dimensions(self.system, self.parameter_values)
+        key = tuple(values.values())
         if key not in self._shapes:
-            values = sizes.parameters_with_fitted_dimensions(self.system, self.parameter_values)
             self._shapes[key] = self.shape_fitter.with_parameter_values(values)
         return self._shapes[key]
 
