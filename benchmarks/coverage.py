@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 from baxter import baxter_foam_y_system
-from make_recordings import OFFSETS, SNAP, TRUTH, within_limits
+from make_recordings import OFFSETS, SNAP, TRUTH, shaken_motion, within_limits
 
 import yid_ocp
 from yid_ocp.config.reader import load_config
@@ -46,7 +46,6 @@ from yid_ocp.virtual.joint_motion import (
     MultisineMotion,
     MultisineOptions,
     grasping_joint_angles,
-    random_multisine_motion,
 )
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.solve import run_solve
@@ -178,13 +177,11 @@ def gentle_enough(
     rng: np.random.Generator,
 ) -> tuple[MultisineMotion, int]:
     """The first of many motions drawn that stays within the robot's limits and does not let the object snap."""
-    excitation = MultisineOptions(
-        gripper_travel=TRAVEL[undeformed], duration=simulation.duration, shake_torque_rms=SHAKE
-    )
+    excitation = MultisineOptions(gripper_travel=TRAVEL[undeformed], duration=simulation.duration)
     trial = replace(simulation, time_step=TRIAL_STEP)
     for _ in range(ATTEMPTS):
         seed = int(rng.integers(2**31))
-        motion = random_multisine_motion(system, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        motion = shaken_motion(system, truth, posture, seed, excitation, SHAKE)
         if within_limits(system, simulate_in_mujoco(system, truth, motion, trial, initial_joint_angles=posture)):
             return motion, seed
     raise ModelError(f"none of {ATTEMPTS} motions stays within the limits", hint="let the arms travel less")

@@ -14,18 +14,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import casadi as ca
 import h5py
 import numpy as np
 from baxter import baxter_foam_y_system
 
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.files import atomic_write
+from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperimentSettings, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
+from yid_ocp.virtual.joint_motion import (
+    MultisineMotion,
+    MultisineOptions,
+    grasping_joint_angles,
+    random_multisine_motion,
+)
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult
 
 # the paper's answer for one arm with vision, the only one of its four in which no stiffness is zero, rounded
@@ -128,16 +135,47 @@ def compress(path: Path) -> None:
         source.visititems(copy)
 
 
+def shaken_motion(
+    system: System,
+    values: Mapping[str, float] | None,
+    posture: Mapping[str, float],
+    seed: int,
+    excitation: MultisineOptions,
+    torque_rms: float,
+    band: tuple[float, float] = (4.0, 9.0),
+    max_speed: float = 0.15,
+) -> MultisineMotion:
+    """A random multisine motion with fast sines added, which accelerate each joint's own inertia.
+
+    Their torque has the root mean square `torque_rms` [N m]. Their frequencies `band` [Hz] should end well below half
+    the torque's sample rate. None is faster than `max_speed` [rad/s], which light wrists reach first.
+    """
+    motion = random_multisine_motion(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
+    if torque_rms == 0.0:
+        return motion
+    q, start = ca.SX.sym("q", system.n_coordinates), [posture.get(name, 0.0) for name in system.mechanism.joint_names]
+    tree, still = system.mechanism_with_values(values), ca.SX(ca.DM.zeros(system.n_coordinates))
+    mass = mass_matrix(lagrangian_first_derivatives(forward_kinematics(tree, q), still, still[:3]), tree)
+    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))
+    shape, rng = motion.frequency.shape, np.random.default_rng(seed)
+    rng.random((3, *shape))  # what the slow sines were drawn from
+    edges = np.linspace(np.log(band[0]), np.log(band[1]), shape[1] + 1)
+    frequency = np.exp(rng.uniform(edges[:-1], edges[1:], shape))
+    omega, torque = 2 * np.pi * frequency, torque_rms * np.sqrt(2.0 / shape[1])
+    own = inertia[list(system.actuated_coordinate_indices), None]
+    amplitude = np.hstack([motion.amplitude, np.minimum(torque / (own * omega**2), max_speed / omega)])
+    phase = np.hstack([motion.phase, rng.uniform(0.0, 2 * np.pi, shape)])
+    return replace(motion, amplitude=amplitude, frequency=np.hstack([motion.frequency, frequency]), phase=phase)
+
+
 def make(folder: Path, torques: Torques) -> None:
     for arms, word, hands in ((1, "single", "one arm"), (2, "dual", "two arms")):
         system = baxter_foam_y_system(arms)
         posture = grasping_joint_angles(system, TRUTH, offsets=OFFSETS[arms])
         for purpose in ("estimate", "held_out"):
             seed = torques.motion_seeds[arms, purpose]
-            excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
-            motion = random_multisine_motion(
-                system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation
-            )
+            excitation = MultisineOptions(gripper_travel=torques.travel[arms])
+            motion = shaken_motion(system, TRUTH, posture, seed, excitation, torques.shake)
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
                 experiment = VirtualExperimentSettings(

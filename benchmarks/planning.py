@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from baxter import baxter_foam_y_system
-from make_recordings import ROUGH, TRUTH
+from make_recordings import ROUGH, TRUTH, shaken_motion
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -44,7 +44,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_injected_effects
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.build import build_step
 from yid_ocp.workflow.diagnose import run_diagnose
@@ -222,10 +222,8 @@ def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] =
     simulation = replace(ROUGH.simulation, duration=RECORDED)
     files = []
     for i, motion_seed in enumerate(MOTIONS):
-        excitation = MultisineOptions(gripper_travel=ROUGH.travel[1], shake_torque_rms=ROUGH.shake, duration=RECORDED)
-        motion = random_multisine_motion(
-            system, TRUTH, seed=motion_seed, initial_joint_angles=posture, excitation=excitation
-        )
+        excitation = MultisineOptions(gripper_travel=ROUGH.travel[1], duration=RECORDED)
+        motion = shaken_motion(system, TRUTH, posture, motion_seed, excitation, ROUGH.shake)
         experiment = VirtualExperimentSettings(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
         files.append(folder / f"motion_{motion_seed}.h5")
         write_recording(run_experiment_with_injected_effects(system, TRUTH, effects, experiment), files[-1])

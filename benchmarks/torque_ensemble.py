@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from baxter import baxter_foam_y_system
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
-from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
+from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE, shaken_motion
 
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.data.recording_hdf5 import write_recording
@@ -39,7 +39,7 @@ from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import sha256_of_folder_sources
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperimentSettings, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "none": ((), ()),
@@ -65,10 +65,8 @@ def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int,
     arms, vision = (1 if experiment.startswith("single") else 2), not experiment.endswith("no_vision")
     system = baxter_foam_y_system(arms)
     posture = grasping_joint_angles(system, TRUTH, offsets=OFFSETS[arms])
-    excitation = MultisineOptions(gripper_travel=ROUGH.travel[arms], shake_torque_rms=ROUGH.shake)
-    motion = random_multisine_motion(
-        system, TRUTH, seed=ROUGH.motion_seeds[arms, "estimate"], initial_joint_angles=posture, excitation=excitation
-    )
+    excitation = MultisineOptions(gripper_travel=ROUGH.travel[arms])
+    motion = shaken_motion(system, TRUTH, posture, ROUGH.motion_seeds[arms, "estimate"], excitation, ROUGH.shake)
     torques = replace(ROUGH, white=tuple(errors[0]), offset=tuple(errors[1]))
     described = VirtualExperimentSettings(
         motion=motion,

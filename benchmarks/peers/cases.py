@@ -120,12 +120,10 @@ def _foam_runs(rough: bool) -> tuple[System, list[SimulationResult]]:
     torques, runs = foam.ROUGH if rough else foam.CLEAN, []
     system = foam.baxter_foam_y_system(2)
     posture = grasping_joint_angles(system, foam.TRUTH, offsets=foam.OFFSETS[2])
-    excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake)
+    excitation = MultisineOptions(gripper_travel=torques.travel[2])
     for purpose in ("estimate", "held_out"):
         seed = torques.motion_seeds[2, purpose]
-        motion = random_multisine_motion(
-            system, foam.TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation
-        )
+        motion = foam.shaken_motion(system, foam.TRUTH, posture, seed, excitation, torques.shake)
         runs.append(simulate_in_mujoco(system, foam.TRUTH, motion, torques.simulation, initial_joint_angles=posture))
     return system, runs
 

@@ -41,12 +41,12 @@ def driven_problem(limited_urdf):
 
 @pytest.fixture(scope="module")
 def moved_experiment(moved_problem):
-    return SplineMotionExperiment.from_options(moved_problem, {}, OPTIONS)
+    return SplineMotionExperiment(moved_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def driven_experiment(driven_problem):
-    return SplineMotionExperiment.from_options(driven_problem, {}, OPTIONS)
+    return SplineMotionExperiment(driven_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +269,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(refused_
         options = SimpleNamespace(clamp_pose_point_names=clamps)
         of = SimpleNamespace(system=problem.system if clamps else servos, episodes=[None], options=options)
         with pytest.raises(ConfigError, match=said):
-            SplineMotionExperiment.from_options(of, {}, OPTIONS)
+            SplineMotionExperiment(of, {}, OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def recorded(urdf: Path) -> Recording:
     own = "".join(f"<{kind} name='{site}{kind}' site='{site}'/>" for site in ("lower", "w_T1") for kind in KINDS)
     text = mujoco_xml(system, time_step=step).replace("</mujoco>", f"<sensor>{own}</sensor></mujoco>")
     model = mujoco_model_from_mjcf_text(text)
-    scene = engine.MujocoModelAndState.from_compiled_model(system, mujoco, model)
+    scene = engine.MujocoModelAndState(system, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[[model.joint(name).id for name in ARM]] = list(START.values())
     waves = (np.array([[0.05], [0.06]]), np.array([[1.1], [1.7]]), np.zeros((2, 1)), 0.3)

@@ -153,9 +153,7 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
 
 def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoModelAndState:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
-    scene = MujocoModelAndState.from_compiled_model(
-        system, mujoco, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step))
-    )
+    scene = MujocoModelAndState(system, mujoco_model_from_mjcf_text(mujoco_xml(system, values, time_step=time_step)))
     scene.data.qpos[:] = scene.model.qpos_spring
     for name, angle in grasping_joint_angles(held, TRUTH).items():
         scene.data.qpos[scene.model.joint(name).id] = angle + 0.1
@@ -295,10 +293,10 @@ def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmar
     made = benchmark_module("make_recordings")
     torques, system = getattr(made, kind), SYSTEMS[arms]
     posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[arms])
-    excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
-    seed, start = torques.motion_seeds[arms, "estimate"], {"initial_joint_angles": posture}
-    motion = random_multisine_motion(system, made.TRUTH, seed=seed, excitation=excitation, **start)
-    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=0.1), **start)
+    excitation = MultisineOptions(gripper_travel=torques.travel[arms])
+    seed, brief = torques.motion_seeds[arms, "estimate"], replace(torques.simulation, duration=0.1)
+    motion = made.shaken_motion(system, made.TRUTH, posture, seed, excitation, torques.shake)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, brief, initial_joint_angles=posture)
     name = f"{['single', 'dual'][arms - 1]}_arm_no_vision_estimate.h5"
     joints = read_recording((DEFAULT_RECORDINGS if torques.white else clean) / name).joints
     error = joints.effort[:11] - run.effort
@@ -338,11 +336,10 @@ def test_motion_starts_smoothly_and_is_drawn_from_the_seed() -> None:
     assert not np.array_equal(random_multisine_motion(SYSTEMS[1], seed=4).amplitude, motion.amplitude)
 
 
-def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone() -> None:
+def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone(benchmark_module) -> None:
     system = SYSTEMS[1]
-    calm = random_multisine_motion(system, seed=3)
-    shaking = MultisineOptions(shake_torque_rms=0.5, shake_frequency_band=(5.0, 8.0), max_shake_speed=0.2)
-    rough = random_multisine_motion(system, seed=3, excitation=shaking)
+    calm, shaken = random_multisine_motion(system, seed=3), benchmark_module("make_recordings").shaken_motion
+    rough = shaken(system, None, grasping_joint_angles(system), 3, MultisineOptions(), 0.5, (5.0, 8.0), 0.2)
     for part in ("amplitude", "frequency", "phase"):
         np.testing.assert_array_equal(getattr(rough, part)[:, :3], getattr(calm, part))
     omega = 2 * np.pi * rough.frequency[:, 3:]

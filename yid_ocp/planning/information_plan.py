@@ -94,7 +94,7 @@ def plan_informative_motion(
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_parameter_names))
     shapes = {name: e.parameters[name].value for e in rivals for name in e.shape_parameter_names}
-    experiment = SplineMotionExperiment.from_options(composed, known | shapes, options, names)
+    experiment = SplineMotionExperiment(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionEvaluator(system, system.point_frames)
     limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
@@ -182,15 +182,8 @@ def _size(effect: EffectBase) -> Array:
 
 
 def _check_room(search: InformativeMotionSearch) -> None:
-    """Raise `ConfigError` if the arms violate their limits at the start."""
+    """Raise `ConfigError` if the arms exceed a velocity, effort or spring limit before they move."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
-    starts = mover.moved_joint_start_positions
-    for name, at, low, high in zip(mover.step.system.prescribed, starts, search.lower, search.upper, strict=False):
-        if not low <= 0.0 <= high:
-            unit = next(joint.unit("rad") for joint in mover.step.system.mechanism.joints if joint.name == name)
-            what = f"joint {name} starts {max(low, -high):.3g} {unit} beyond its position limit"
-            where, hint = "plan.start_joint_positions", f"set plan.start_joint_positions.{name} within its limits"
-            raise ConfigError(what, where=where, allowed=f"{at + low:.4g} to {at + high:.4g} {unit}", hint=hint)
     values, _ = search.limits.constraints_and_jacobian(mover.simulate_path(still), still)
     if broken := search.limits.worst_value_and_bound_by_violated_limit(values):
         parts = ((what, *passed) for what, passed in broken.items())

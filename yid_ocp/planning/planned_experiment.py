@@ -9,7 +9,7 @@ problem, which is driven by these torques. A camera gives the same information p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -39,27 +39,22 @@ _PATH_DIFFERENCE_STEP = 1e-6  # difference step of the arms' motion for the effe
 _SPLINE_DIFFERENCE_STEP = 1e-5  # difference step of a motion's coefficient [rad or m]
 
 
-@dataclass(frozen=True, eq=False)
 class SplineMotionExperiment:
-    """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w (K, nc)."""
+    """A planned experiment whose predicted recording and sensitivities depend on spline coefficients w (K, nc).
 
-    configured_problem: EstimationProblem  # from the settings; its first recording defines sensors, noise and rates
-    parameter_values: Mapping[str, float]  # values at which sensitivities are computed
-    simulator: joint_paths.PathSimulator  # simulator of the same system with prescribed arms
-    free_parameters: tuple[str, ...]  # parameters of the problem, and amplitudes of effects to discriminate
+    The first recording of `problem`, the configured one, defines sensors, noise and rates. Sensitivities are computed
+    at the parameter `values`, by default those of the problem. `names` are the free parameters of the problem, and the
+    amplitudes of effects to discriminate. Raises `ConfigError` if no joint's motion can be planned, if the arms have
+    servos, or if the motion is too short for the filter of efforts, and `ModelError` if no equilibrium is found.
+    """
 
-    @staticmethod
-    def from_options(
+    def __init__(
+        self,
         problem: EstimationProblem,
         values: Mapping[str, float],
         options: joint_paths.PlanOptions,
         names: Sequence[str] = (),
-    ) -> SplineMotionExperiment:
-        """Make a planned experiment from plan options, at parameter `values` and with the free parameters `names`.
-
-        Raises `ConfigError` if no joint's motion can be planned, if the arms have servos, or if the motion is too short
-        for the filter of efforts. Raises `ModelError` if no equilibrium is found.
-        """
+    ) -> None:
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_point_names or not (system.driven or system.prescribed):
             said, hint = "the model has no robot arm that a plan can move", "set model.robot and model.arms"
@@ -72,17 +67,19 @@ class SplineMotionExperiment:
             raise ConfigError(what, where="plan.goal", allowed="arms whose mode is driven or prescribed", hint=hint)
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
         step = problem.step if not system.driven else compile_step_like(problem.step, moved)
-        known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
-        theta = step.system.parameters.vector(known)
-        first = np.array(episode.initial_known_coordinates)
-        if options.start_joint_positions is not None:
-            first = joint_paths.start_joint_positions_as_array(step.system, options.start_joint_positions)
+        self.configured_problem, self.free_parameters = problem, tuple(names) or problem.free
+        known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True))
+        self.parameter_values: Mapping[str, float] = known | dict(values)
+        theta = step.system.parameters.vector(self.parameter_values)
+        posture = options.start_joint_positions
+        if posture is None:
+            posture = dict(zip(step.system.prescribed, episode.initial_known_coordinates, strict=True))
+        first = joint_paths.start_joint_positions_as_array(step.system, posture)
         path = joint_paths.RestToRestSplineBasis(options.duration, options.n_spline_coefficients)
-        mover = joint_paths.PathSimulator(
-            step, theta, joint_paths.solve_start_equilibrium(step, theta, first), path, options.hold_duration
-        )
-        _check_long_enough(problem, float(mover.node_times[-1]))
-        return SplineMotionExperiment(problem, known, mover, tuple(names) or problem.free)
+        rest = joint_paths.solve_start_equilibrium(step, theta, first)
+        # of the same system with prescribed arms
+        self.simulator = joint_paths.PathSimulator(step, theta, rest, path, options.hold_duration)
+        _check_long_enough(problem, float(self.simulator.node_times[-1]))
 
     def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
         """Noise-free predicted recording of a motion; points above the rate `fastest` [Hz] are thinned."""

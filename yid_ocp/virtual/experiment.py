@@ -143,8 +143,7 @@ def recording_from_simulation(
     if held:
         clean = run.point_positions[:, [system.point_frames.index(point) for point in held]]
         position = _noisy(clean, chosen.arm_noise.point_std, streams["arm_points"])
-        std = np.full(clean.shape, chosen.arm_noise.point_std)
-        groups.append(PointGroup("points_arm", held, run.t, position, std, "arm"))
+        groups.append(PointGroup("points_arm", held, run.t, position, np.array(chosen.arm_noise.point_std), "arm"))
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
     theta = dict(zip(system.parameters.names, map(float, system.parameters.vector(values)), strict=True))
@@ -209,7 +208,7 @@ def _camera_points(
     target = run.point_positions[0].mean(0)
     beside = target + 2.0 * _CAMERA_DIRECTION / np.linalg.norm(_CAMERA_DIRECTION)
     pose = look_at_pose(beside, target) if camera.pose is None else np.asarray(camera.pose, float)
-    std = np.full(clean.shape, camera.point_std)
+    std = np.array(camera.point_std)
     return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", camera_pose=pose)
 
 

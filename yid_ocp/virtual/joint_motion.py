@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
-from yid_ocp.model.kinematics import forward_kinematics, lagrangian_first_derivatives, mass_matrix
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import CasadiEvaluator
@@ -72,7 +72,7 @@ class MultisineOptions:
 
     The motion of each arm is scaled separately to `gripper_travel`. With two arms, much more travel than the default
     makes the foam Y snap between shapes. A frequency band is divided into parts of equal width in log frequency, with
-    one sine in each part. The band of the additional `shake` sines should end well below half the torque's sample rate.
+    one sine in each part.
     """
 
     gripper_travel: float = 0.11  # largest distance of a gripper from its start [m]
@@ -81,10 +81,6 @@ class MultisineOptions:
     frequency_band: tuple[float, float] = (0.2, 2.0)  # [Hz]
     ramp_time: float = 1.0  # [s]
     duration: float = 5.0  # [s]
-    # RMS torque by which additional fast sines accelerate each joint's own inertia; zero: no such sines [N m]
-    shake_torque_rms: float = 0.0
-    shake_frequency_band: tuple[float, float] = (4.0, 9.0)  # [Hz]
-    max_shake_speed: float = 0.15  # speed limit of each of these sines, which light wrists reach first [rad/s]
     has_second_harmonic: bool = False  # whether each sine comes with a second one at twice its frequency
 
 
@@ -129,11 +125,7 @@ def random_multisine_motion(
         fastest = max(float(np.abs(motion.offset_and_derivatives(t)[1]).max()) for t in times)
         joints = range(len(motion.joints))
         motion = _scaled(motion, joints, np.full(len(joints), chosen.max_joint_speed / fastest))
-    if chosen.shake_torque_rms == 0.0:
-        return motion
-    rigid = lagrangian_first_derivatives(kinematics, ca.SX(ca.DM.zeros(len(q0))), ca.SX(ca.DM.zeros(3)))
-    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
-    return _shaken(motion, chosen, inertia[list(system.actuated_coordinate_indices)], rng)
+    return motion
 
 
 def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> MultisineMotion:
@@ -146,19 +138,6 @@ def _drawn_frequencies(band: tuple[float, float], shape: tuple[int, int], rng: n
     """One random frequency in each of equal parts, in log frequency, of a band."""
     edges = np.linspace(math.log(band[0]), math.log(band[1]), shape[1] + 1)
     return np.exp(rng.uniform(edges[:-1], edges[1:], shape))
-
-
-def _shaken(
-    motion: MultisineMotion, excitation: MultisineOptions, inertia: Array, rng: np.random.Generator
-) -> MultisineMotion:
-    """The motion with fast sines added. `inertia` (nj,) is that of the driven joints [kg m^2]."""
-    shape = motion.frequency.shape
-    frequency = _drawn_frequencies(excitation.shake_frequency_band, shape, rng)
-    omega, torque = 2 * math.pi * frequency, excitation.shake_torque_rms * math.sqrt(2.0 / shape[1])
-    amplitude = np.minimum(torque / (inertia[:, None] * omega**2), excitation.max_shake_speed / omega)
-    phase = np.hstack([motion.phase, rng.uniform(0.0, 2 * math.pi, shape)])
-    amplitude, frequency = np.hstack([motion.amplitude, amplitude]), np.hstack([motion.frequency, frequency])
-    return replace(motion, amplitude=amplitude, frequency=frequency, phase=phase)
 
 
 def _scale(excitation: MultisineOptions, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:

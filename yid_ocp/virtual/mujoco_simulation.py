@@ -11,7 +11,6 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from types import ModuleType
 from typing import Any, Protocol, get_args
 
 import numpy as np
@@ -168,20 +167,20 @@ def simulate_in_mujoco(
             injected.edit_model(model)
             mujoco.set_mjcb_passive(injected.add_forces)
             held.callback(mujoco.set_mjcb_passive, None)
-        scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
+        scene = MujocoModelAndState(system, model)
         start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-        controller: TrackingController | _ServoCommander
         if system.servos:
-            controller = _ServoCommander(scene, motion)
-            _settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
+            control = _servo_command_function(scene, motion)
+            _settle_under_servo_commands(scene, nominal_damping, control(0.0))
         else:
-            controller = TrackingController(scene, motion, settle_and_return_holding_torques(scene, nominal_damping))
+            balance = settle_and_return_holding_torques(scene, nominal_damping)
+            control = TrackingController(scene, motion, balance).apply_and_return_control_input
         if injected is not None:
             injected.begin_motion(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
-        result = _play(scene, controller, chosen, frames)
+        result = _play(scene, control, chosen, frames)
         lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
         hint = f"pass a time_step below {chosen.time_step:g} s, or a slower motion"
@@ -190,25 +189,21 @@ def simulate_in_mujoco(
     return result
 
 
-@dataclass(frozen=True, eq=False)
 class MujocoModelAndState:
-    """A MuJoCo model and its state, with the MuJoCo ids of the system's joints and points."""
+    """A compiled MuJoCo model (`mujoco.MjModel`) with a new state, and the MuJoCo ids of a system's joints and points.
 
-    mujoco: ModuleType
-    model: Any  # `mujoco.MjModel`
-    data: Any  # `mujoco.MjData`
-    joint_ids: IntArray  # in the order of the system's coordinates
-    moved_joint_ids: IntArray  # of the driven joints, or of the prescribed joints if none is driven
-    point_site_ids: list[int]  # in the order of `system.point_frames`
+    `joint_ids` are in the order of the system's coordinates, `point_site_ids` in the order of `system.point_frames`.
+    `moved_joint_ids` are those of the driven joints, or of the prescribed joints if none is driven.
+    """
 
-    @staticmethod
-    def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoModelAndState:
-        """Make the scene of a compiled MuJoCo model, with a new state and the ids that belong to `system`."""
+    def __init__(self, system: System, model: Any) -> None:
+        self.mujoco, self.model = import_mujoco(), model
+        self.data = self.mujoco.MjData(model)
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
-        order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
-        sites = [model.site(name).id for name in system.point_frames]
-        moved = order[list(system.actuated_coordinate_indices or system.prescribed_coordinate_indices)]
-        return MujocoModelAndState(mujoco, model, mujoco.MjData(model), order, moved, sites)
+        self.joint_ids: IntArray = np.array([model.joint(name).id for name in system.mechanism.joint_names])
+        moved = system.actuated_coordinate_indices or system.prescribed_coordinate_indices
+        self.moved_joint_ids = self.joint_ids[list(moved)]
+        self.point_site_ids = [model.site(name).id for name in system.point_frames]
 
 
 def settle_and_return_holding_torques(scene: MujocoModelAndState, damping: Array) -> Array:
@@ -288,17 +283,15 @@ class TrackingController:
         return np.array(shadow.qfrc_inverse[driven])
 
 
-class _ServoCommander:
-    """Controller that commands position servos along a motion, relative to the joint angles at its creation."""
+def _servo_command_function(scene: MujocoModelAndState, motion: JointOffsetMotion) -> Callable[[float], Array]:
+    """Function of time that commands position servos along a motion from the present angles, and returns commands."""
+    start = scene.data.qpos[scene.moved_joint_ids].copy()
 
-    def __init__(self, scene: MujocoModelAndState, motion: JointOffsetMotion) -> None:
-        self._scene, self._motion = scene, motion
-        self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
+    def control(t: float) -> Array:
+        scene.data.ctrl[:] = commands = start + motion.offset_and_derivatives(t)[0]
+        return np.asarray(commands)
 
-    def apply_and_return_control_input(self, t: float) -> Array:
-        commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
-        self._scene.data.ctrl[:] = commands
-        return commands
+    return control
 
 
 def _initialize_actuator_history(scene: MujocoModelAndState, commands: Array) -> None:
@@ -355,12 +348,12 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
 
 
 def _play(
-    scene: MujocoModelAndState,
-    controller: TrackingController | _ServoCommander,
-    simulation: SimulationOptions,
-    frames: IntArray,
+    scene: MujocoModelAndState, control: Callable[[float], Array], simulation: SimulationOptions, frames: IntArray
 ) -> SimulationResult:
-    """Simulate one controller period after another, with constant inputs in each. `frames`: steps of camera frames."""
+    """Simulate one controller period after another, with constant inputs in each. `frames`: steps of camera frames.
+
+    `control(t)` applies and returns the inputs from time t [s] on.
+    """
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     periods, ticks = simulation.controller_periods_per_sample, simulation._tick_steps()
     steps_per_second = simulation._steps_per_period * periods * simulation.sample_rate
@@ -368,7 +361,7 @@ def _play(
     for tick, done in enumerate(ticks.tolist()):
         end = done if tick == len(ticks) - 1 else int(ticks[tick + 1])
         mujoco.mj_kinematics(model, data)
-        torques.append(controller.apply_and_return_control_input(done / steps_per_second))
+        torques.append(control(done / steps_per_second))
         if tick % periods == 0:
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
@@ -417,7 +410,7 @@ def replay_mismatch_by_channel(
     `GROUP.POINT` for every point [m]. Raises `ModelError` if channels are missing or the simulation fails, and
     `DataError` if MuJoCo is not installed.
     """
-    mujoco, model = import_mujoco(), mujoco_model_from_mjcf_text(text)
+    model = mujoco_model_from_mjcf_text(text)
     moved, joints = system.driven or system.prescribed, recording.joints
     missing = set(moved).difference(() if joints is None else joints.names)
     if joints is None or missing or not moved:
@@ -431,7 +424,7 @@ def replay_mismatch_by_channel(
         what, where = f"the recording has no {words} of the driven joints", f"recording '{recording.name}': joints"
         raise ModelError(what, where=where, allowed=f"the channel {quantity}", hint=f"import it again with {words}")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
-    scene = MujocoModelAndState.from_compiled_model(system, mujoco, model)
+    scene = MujocoModelAndState(system, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.moved_joint_ids] = position[:_START].mean(axis=0)
     if system.servos:

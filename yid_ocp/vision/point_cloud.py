@@ -212,9 +212,7 @@ def _light_directions(colours: Array) -> Array:
 
 def weighted_median(values: Array, weight: Array) -> float:
     """Return the weighted median: the smallest value up to which the weights sum to at least half of the total."""
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+    return float(np.quantile(values, 0.5, weights=weight, method="inverted_cdf"))
 
 
 @dataclass(frozen=True, eq=False)

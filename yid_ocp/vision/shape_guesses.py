@@ -186,7 +186,7 @@ class ObservedObjectEnd:
     position_std: float  # standard deviation of the position along `direction` [m]
 
 
-class _InitialShape(NamedTuple):
+class InitialShape(NamedTuple):
     """Initial shape of a fit: configuration (n,), root position (3,) [m] and observed ends."""
 
     q: Array
@@ -240,7 +240,7 @@ class ShapeGuessFinder:
         reaches = zip(chains, far[0, starts], far[0, 1:], behind, strict=True)
         self._links = [_Link(chain, float(begin), float(end), tip) for chain, begin, end, tip in reaches]
 
-    def shape_guesses_along_centerline(self, trace: _Centerline) -> list[_InitialShape]:
+    def shape_guesses_along_centerline(self, trace: _Centerline) -> list[InitialShape]:
         """Find initial shapes that follow a centerline whose path lengths between ends match the object's lengths.
 
         Raises `DataError` for other ends or lengths: part of the object is hidden, or another body touches it.
@@ -266,7 +266,7 @@ class ShapeGuessFinder:
         kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * n_ends]
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]
 
-    def _along(self, trace: _Centerline, ends: Sequence[int]) -> _InitialShape:
+    def _along(self, trace: _Centerline, ends: Sequence[int]) -> InitialShape:
         """The initial shape whose root and tips, in this order, are at the nodes `ends` of the centerline."""
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
@@ -283,7 +283,7 @@ class ShapeGuessFinder:
             ahead = trace.outward_direction(end)
             middle = trace.nodes[end] + 0.5 * width * ahead
             anchors.append(ObservedObjectEnd(corner, ahead, middle, width / np.sqrt(12.0)))
-        return _InitialShape(q, place, tuple(anchors))
+        return InitialShape(q, place, tuple(anchors))
 
     def _orientation(self, q: Array, joint: int) -> Array:
         """Orientation (3, 3) of a joint's moving frame in the world."""

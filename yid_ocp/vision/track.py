@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,11 +33,9 @@ from yid_ocp.vision.frames import FrameSequence, OcclusionMap, dropped_frame_err
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, SequenceEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
-from yid_ocp.vision.shape_guesses import ShapeGuessFinder, add_free_root_joints, cloud_centerline_tree
+from yid_ocp.vision.shape_guesses import InitialShape, add_free_root_joints, cloud_centerline_tree
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, SceneDescription, TriangleMesh
 from yid_ocp.vision.track_result import FrameReport, SingleFrameStages, TrackResult
-
-_Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
 _MIN_POINTS, _MAX_POINTS = 150, 6000  # of an object in a frame: fewer are too few, of more a random subset is used
 _MAX_SIZED_FRAMES = 8  # largest number of frames used to estimate the object's dimensions
@@ -70,18 +67,6 @@ def track_object(
     common = tracker.estimate_shared_values()
     frames = [tracker.process_one_frame(i, common) for i in tracker.frame_order]
     return tracker.track_result_from_frame_reports(*tracker.align_root_ends_and_mark_outlying_frames(frames), common)
-
-
-@dataclass(eq=False)
-class _Work:
-    """A frame during its processing: its report so far, its filtered cloud and its skeleton."""
-
-    report: FrameReport
-    filtered: WeightedCloud | None = None
-    skeleton: CloudSkeleton | None = None
-
-    def say(self, **changes: Any) -> None:
-        self.report = replace(self.report, **changes)
 
 
 class _Look(NamedTuple):
@@ -148,7 +133,7 @@ class SingleFrameTracker:
             hint = "leave track.options.filters.object_colours out, or record clouds with colours"
             raise DataError("the clouds have no colours", where=sequence.source, allowed="coloured clouds", hint=hint)
         self._asked = _spread(usable, _MAX_SIZED_FRAMES)
-        self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
+        self._shapes: dict[tuple[float, ...], ShapeFitter] = {}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
     def _configuration_at_rest(self, t: float) -> Array:
@@ -227,22 +212,24 @@ class SingleFrameTracker:
 
     def _shape(self, sizes: sequence_calibration.TubeDimensionEstimates) -> ShapeFitter:
         """The shape fitter with the estimated dimensions of the object."""
-        used = sizes.estimated_dimension_mask
-        key = tuple(np.where(used, sizes.log_ratio, 0.0).tolist()) if any(used) else ()
+        values = sizes.parameters_with_fitted_dimensions(self.system, self.parameter_values)
+        key = tuple(values.values())
         if key not in self._shapes:
-            values = sizes.parameters_with_fitted_dimensions(self.system, self.parameter_values)
             self._shapes[key] = self.shape_fitter.with_parameter_values(values)
         return self._shapes[key]
 
     def _removed(
-        self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
+        self, q: Array, calibration: CameraCalibration, background: BackgroundPoints, beyond: float
     ) -> Callable[[Array], BoolArray]:
-        """Function that returns the mask of the positions (S, 3) that the filters remove, for the robot at `q`."""
+        """Function that returns the mask of the positions (S, 3) that the filters remove, for the robot at `q`.
+
+        Positions up to `beyond` [m] further from the robot and the background than its distance are removed as well.
+        """
         is_inside = self.object_region.membership_mask_function_at(q, calibration.camera_position)
-        within = self.options.filters.robot_padding + self._widest
+        within = self.options.filters.robot_padding + beyond
 
         def removed(places: Array) -> BoolArray:
-            gone = ~is_inside(places) | background.near_background_mask(places, self._widest)
+            gone = ~is_inside(places) | background.near_background_mask(places, beyond)
             if self.robot_surfaces is not None:
                 gone |= self.robot_surfaces.within_surface_distance_mask(places, q, within)
             return gone
@@ -298,7 +285,7 @@ class SingleFrameTracker:
         is_rival = len(fits) > 1 and fits[1].mean_distance < _RIVAL_SHAPE_RATIO * fits[0].mean_distance
         other = fits[1] if is_rival else None
         spent = work.report.cpu_seconds + time.process_time() - begun
-        work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason or "")
+        work.update_report(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason or "")
         return work.report
 
     def frame_clouds_and_skeleton(self, frame: FrameReport, common: SequenceEstimates) -> SingleFrameStages | None:
@@ -308,9 +295,9 @@ class SingleFrameTracker:
             cloud = calibration.camera_state.measured_to_world_points(self.sequence.load_cloud(frame.index))
         except DataError:
             return None
-        work, _ = self._look(frame.index, calibration, common.background)
-        filtered = None if work.filtered is None else work.filtered.points
-        return SingleFrameStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
+        stages, _ = self._look(frame.index, calibration, common.background)
+        stages.report, stages.raw_points = frame, cloud
+        return stages
 
     def frame_report_before_processing(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Return a frame's report before its processing. `reason` says why the frame is dropped; empty if it is not."""
@@ -368,21 +355,22 @@ class SingleFrameTracker:
 
     def _look(
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
-    ) -> tuple[_Work, _Look | None]:
+    ) -> tuple[SingleFrameStages, _Look | None]:
         """The work on a frame, and its data for the shape fit; None, with a reason in the report, if it is dropped."""
-        work = _Work(self.frame_report_before_processing(index, calibration, self._reasons.get(index, "")))
+        report = self.frame_report_before_processing(index, calibration, self._reasons.get(index, ""))
+        work = SingleFrameStages(report, calibration.camera_position)
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
-            work.say(drop_reason=error.what)
+            work.update_report(drop_reason=error.what)
             return work, None
 
-    def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
+    def _prepared(self, work: SingleFrameStages, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
         """Prepare a frame's data for the shape fit. Raises `DataError` with the reason if the frame is dropped."""
         index, stamp, t = work.report.index, work.report.stamp, work.report.joint_time
         options, state = self.options, calibration.camera_state
         cloud, raw = self._read(index, calibration)
-        work.say(n_raw_points=len(raw))
+        work.update_report(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
             raise dropped_frame_error("no joint angles were recorded at the time of the image")
         rng = np.random.default_rng([options.seed, index])
@@ -390,63 +378,56 @@ class SingleFrameTracker:
         if self.arm_surface is not None and typical is not None:
             own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
-                work.say(stamp_delay=own.delay)
+                work.update_report(stamp_delay=own.delay)
                 if own.is_significant:
                     late = f"the image's time stamp is {'late' if own.delay > 0 else 'early'}"
                     raise dropped_frame_error(f"{late}: it is {1e3 * abs(own.delay):.0f} ms off the camera's clock")
         q = self._configuration_at_rest(t)
-        filters, kept = options.filters, np.ones(len(cloud), bool)
-        if self.robot_surfaces is not None:
-            kept = ~self.robot_surfaces.within_surface_distance_mask(cloud.points, q, filters.robot_padding)
-        kept[kept] = ~background.near_background_mask(cloud.points[kept])
+        kept = ~self._removed(q, calibration, background, 0.0)(cloud.points)
         # relative to the robot's points: among all surfaces, outliers are few
         cloud = cloud.select(point_cloud.statistical_inlier_mask(cloud, kept))
-        work.filtered = cloud
-        work.say(n_filtered_points=len(cloud))
+        work.filtered_points = cloud.points
+        work.update_report(n_filtered_points=len(cloud))
         if len(cloud) < _MIN_POINTS:
             raise dropped_frame_error(f"too few points of the object are left: {len(cloud)} of {_MIN_POINTS} needed")
         if len(cloud) > _MAX_POINTS:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), _MAX_POINTS, replace=False)))
-            work.say(n_filtered_points=len(cloud))
+            work.update_report(n_filtered_points=len(cloud))
         begun = time.process_time()
+        removed = self._removed(q, calibration, background, self._widest)
         view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
-        given = calibration.camera_position, view, self._removed(q, calibration, background)
+        skeleton, mask, guesses = self._trace(work, cloud, rng)
+        cloud = cloud.select(mask)
+        work.filtered_points = cloud.points
+        seen = cloud.points, cloud.point_weights, skeleton.nodes, work.camera_position, view, removed
+        sights = [ProcessedFrameCloud(*seen, guess.end_anchors) for guess in guesses] or [ProcessedFrameCloud(*seen)]
+        work.update_report(cpu_seconds=time.process_time() - begun)
+        return _Look(sights, q, [(guess.q,) for guess in guesses] or [()])
+
+    def _trace(
+        self, work: SingleFrameStages, cloud: WeightedCloud, rng: np.random.Generator
+    ) -> tuple[CloudSkeleton, BoolArray, list[InitialShape]]:
+        """The skeleton of an object in a cloud, the mask of its points, and initial shapes if its root is to be found.
+
+        There is one initial shape for each assignment of the object's ends. Raises `DataError` for an unusable cloud.
+        """
+        diameter, nearest = 2.0 * self._widest, self.options.approximate_root_position
         if self.make_shape_guess_finder is None:
-            look = self._held(work, cloud, q, rng, given)
-        else:
-            look = self._anywhere(self.make_shape_guess_finder, work, cloud, rng, given)
-        work.say(cpu_seconds=time.process_time() - begun)
-        return look
-
-    def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
-        """Data for the fit of an object whose root position follows from the model: one cloud with its skeleton."""
-        found = point_cloud.extract_skeleton_graph(cloud, rng, 2.0 * self._widest)
-        work.skeleton = found
-        work.say(n_skeleton_nodes=len(found.nodes))
-        if not len(found.nodes):
-            raise dropped_frame_error("the points are nowhere dense enough to trace the object")
-        work.filtered = rest = cloud.select(found.node_of_point >= 0)
-        return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
-
-    def _anywhere(
-        self, starts: ShapeGuessFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
-    ) -> _Look:
-        """Data for the fit of an object with an unknown root position: a cloud for each assignment of its ends."""
-        diameter, options = 2.0 * self._widest, self.options
+            work.skeleton = found = point_cloud.extract_skeleton_graph(cloud, rng, diameter)
+            work.update_report(n_skeleton_nodes=len(found.nodes))
+            if not len(found.nodes):
+                raise dropped_frame_error("the points are nowhere dense enough to trace the object")
+            return found, found.node_of_point >= 0, []
         course = cloud_centerline_tree(cloud, diameter, point_cloud.MAX_EDGE_LENGTH, rng)
         work.skeleton = course.to_skeleton
-        work.say(n_skeleton_nodes=len(course.nodes))
+        work.update_report(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):
             raise dropped_frame_error("the object crosses or touches itself: its cloud closes a loop")
-        found = starts.shape_guesses_along_centerline(course)
-        if options.approximate_root_position is not None:
-            place = np.array(options.approximate_root_position)
-            near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position
-            found = [start for start in found if np.array_equal(start.root_position, near)]
-        work.filtered = rest = cloud.select(cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter)
-        seen = rest.points, rest.point_weights, course.nodes, *given
-        sights = [ProcessedFrameCloud(*seen, start.end_anchors) for start in found]
-        return _Look(sights, self.shape_fitter.rest_configuration, [(start.q,) for start in found])
+        starts = self.make_shape_guess_finder.shape_guesses_along_centerline(course)
+        if nearest is not None:
+            near = min(starts, key=lambda start: math.dist(start.root_position, nearest)).root_position
+            starts = [start for start in starts if np.array_equal(start.root_position, near)]
+        return work.skeleton, cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter, starts
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:

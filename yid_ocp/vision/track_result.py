@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,15 +52,19 @@ def count_dropped_frames_by_reason(frames: Iterable[FrameReport]) -> dict[str, i
     return dict(Counter(frame.drop_reason.partition(":")[0] for frame in frames if not frame.is_good).most_common())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SingleFrameStages:
-    """The processing stages of one frame, for figures. Stages that a dropped frame did not reach are None."""
+    """The processing stages of one frame so far. Stages that a dropped frame did not reach are None."""
 
     report: FrameReport
     camera_position: Array  # (3,) [m]
-    raw_points: Array  # (N, 3), in the world [m]
-    filtered_points: Array | None  # (N, 3), points that the filters keep [m]
-    skeleton: CloudSkeleton | None
+    raw_points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
+    filtered_points: Array | None = None  # (N, 3), points that the filters keep [m]
+    skeleton: CloudSkeleton | None = None
+
+    def update_report(self, **changes: Any) -> None:
+        """Change entries of the report."""
+        self.report = replace(self.report, **changes)
 
 
 @dataclass(frozen=True, eq=False)
