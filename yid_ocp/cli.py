@@ -298,6 +298,10 @@ class _Parser(argparse.ArgumentParser):
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
             if not flag.startswith("-"):
                 what, hint = f"'{rest[0]}' is one argument too many", f"leave it out, or {self._help()}"
+                words = [*(args or ())]
+                before = words[words.index(rest[0]) - 1] if rest[0] in words else ""
+                if getattr(self._option_string_actions.get(before), "nargs", None) == 0:
+                    what = f"{before} takes no value, so {what}"
                 if lacking := [own for own in getattr(found, "overrides", None) or () if "=" not in own]:
                     name = lacking[0].rstrip(":")
                     what, hint = f"--set {name} has no value", f"write --set {name}=VALUE, without spaces"

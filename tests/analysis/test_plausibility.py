@@ -386,14 +386,16 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
-        told = 1e-3 * size * (-1 if "slowly" in doubt.what or " ms early" in doubt.what else 1)
-        assert told == pytest.approx(drift if drift else late, rel=0.05, abs=3e-3 * std)
+        backward = "slowly" if drift else " ms early"
+        told = (1e-2 if drift else 1e-3) * size * (-1 if backward in doubt.what else 1)
+        assert told == pytest.approx(drift if drift else late, rel=0.05, abs=(3e-2 if drift else 3e-3) * std)
         assert (doubt.group, doubt.severity) == ("points_arm", "not_trusted")
         assert doubt.setting == "sensors.points_arm.use: false"
         # over the limit of half a period of both, at the end of the recording for a drift
         assert doubt.limit_violation_ratio == pytest.approx(abs(5.0 * drift if drift else late) / 0.01, rel=0.03)
         if drift:
-            begin, end = map(float, re.findall(r"([-+][.\d]+) ms", doubt.what))
+            ends = re.findall(r"([.\d]+) ms (late|early)", doubt.what)
+            begin, end = (float(number) * (1 if side == "late" else -1) for number, side in ends)
             assert (end - begin, end + begin) == pytest.approx((5e3 * drift, 2e3 * late), abs=2.0)
 
 

@@ -118,8 +118,8 @@ def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carri
     """The same pendulum with its noise stated ten times too small."""
     settings = (*NO_REPORT, "sensors={joints.effort: {std: 0.001}}", "compare.methods={gauss_newton: {}}")
     done = carried_out(command, pendulum, settings=settings)
-    doubt, _, text = " ".join(done.out.split()).partition("Do not use the values yet, because the model ")
-    assert text.partition(" First follow the advice on the issues.")[0].endswith("; noise alone gives 1).")
+    doubt, _, text = " ".join(done.out.split()).partition("The model does not explain the recordings either: chi2 ")
+    assert text.partition(" First follow the advice above.")[0].endswith("; noise alone gives 1.")
     assert not doubt or doubt.startswith("Use no value of a fit yet, because a channel has more ")
     assert "in doubt" in done.out
     result = done.result

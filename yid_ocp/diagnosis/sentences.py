@@ -243,7 +243,10 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     other = f"The size of {laws} may contain other friction, such as viscous friction, that is not in the model."
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
-    blocks = "Every second block of time is held out, as recordings.held_out is empty. Only `solve` fits all data."
+    blocks = (
+        "The values use half of the data, as recordings.held_out is empty: every second block of time is held out. "
+    )
+    blocks += "`solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
     fitted, problem = result.nominal_model.values, result.nominal_model.problem
     divided = problem.options.divided_links_model

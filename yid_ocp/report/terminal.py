@@ -196,7 +196,8 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     if is_coarse:
         said += " First make the model finer, as follows."
     elif not fit["data_trusted"]:
-        said += " First follow the advice on the issues."
+        said = "The model does not explain the recordings either: chi2 per degree of freedom is "
+        said += f"{fit['chi2_per_dof']:.3g}; noise alone gives 1. First follow the advice above."
     elif near:
         said += f" Also check size and unit of the start values of {names}: near them the recordings hardly depend on "
         said += "them, so the fit could not correct a wrong one."

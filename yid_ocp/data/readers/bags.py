@@ -205,7 +205,8 @@ def _read_bag(
     seconds = time_since_first_message_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     if unstamped := sum(message.stamp <= 0 for message in used_messages):
-        more = (*more, f"{unstamped} of {len(used_messages)} messages have no stamp, so times of recording are used")
+        lost = f"{unstamped} of {len(used_messages)} messages have no stamp"
+        more = (*more, f"{lost}, so the times at which the bag received them count")
     points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, distance), seconds, str(path))

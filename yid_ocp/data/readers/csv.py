@@ -209,6 +209,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     if unknown:
         options["column_meanings"] = unknown
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
+    has_times = any(m == ("t", "") for m, _ in known)
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
     notes = [f"{bad} of {n_lines} lines are not rows of numbers. --skip-bad-lines leaves them out"] if bad else []
     clean = table[np.isfinite(t)]
@@ -224,7 +225,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
         becomes = ":".join(filter(None, meaning or ()))
-        rate = mean_sample_rate(second * t[np.isfinite(column + t)]) if ok else math.nan
+        rate = mean_sample_rate(second * t[np.isfinite(column + t)]) if ok and has_times else math.nan
         sources.append(base.TopicOrColumnSummary(name, kind, count, rate, becomes))
     return base.FilePreview(tuple(sources), options, (*notes, *(reason for _, reason in guessed)))
 
