@@ -296,6 +296,8 @@ def test_the_published_values_are_those_of_the_paper():
 class Means:
     """One unknown measured once by every recording, and the memory of one branch; without it predictions are off."""
 
+    options = ProblemOptions()
+
     def __init__(self, values, speeds, names=("k", "a.memory"), off=0.0):
         self.values, self.unknown_names, self.off = np.array(values, float), names, off
         self.shared_parameters = self.free = names
@@ -359,15 +361,13 @@ def solved(monkeypatch):
 )
 def test_nothing_is_asked_where_nothing_is_in_question(solved, names, speeds):
     problem, found = Means((1.0, 2.0, 3.0), speeds, names), fitted((2.0, 0.5), names)
-    chosen = choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())
+    chosen = choose_fit_with_or_without_shape_memory(problem, None, found)
     assert (chosen, solved.problems) == ((problem, found, ""), [])
 
 
 def test_a_single_recording_in_motion_bears_nothing_out(solved):
     moving = Means((1.0, 2.0, 3.0), (0.5, 0.0, None))
-    problem, found, message = choose_fit_with_or_without_shape_memory(
-        moving, None, fitted((2.0, 0.5)), ExcessResidualCriteria()
-    )
+    problem, found, message = choose_fit_with_or_without_shape_memory(moving, None, fitted((2.0, 0.5)))
     assert problem is solved.problems[0]
     assert (problem.unknown_names, found.x.tolist()) == (("k",), [2.0])
     assert "add a second recording that starts in motion" in message
@@ -390,7 +390,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     """Each from the others alone: the first from a mean of 4, the last from 1.5, wherever the fit of all stands."""
     problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
     problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
-    chosen, _, message = choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())
+    chosen, _, message = choose_fit_with_or_without_shape_memory(problem, None, found)
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (chosen is problem) is kept
@@ -401,12 +401,9 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert (
-        "of inf times the noise"
-        in choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())[2]
-    )
+    assert "of inf times the noise" in choose_fit_with_or_without_shape_memory(problem, None, found)[2]
     solved.ok = False
-    assert choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())[1] is found
+    assert choose_fit_with_or_without_shape_memory(problem, None, found)[1] is found
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])
