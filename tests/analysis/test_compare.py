@@ -59,13 +59,6 @@ def test_a_start_beyond_a_bound_is_refused_by_name(problem, start, said):
         estimation.solve(problem, initial_unknowns=start)
 
 
-def test_a_method_that_stops_early_is_said_to_differ(problem):
-    found = compare_methods(problem, [GaussNewton(), SteepestDescent(max_iterations=1)])
-    assert found.reference_method == "gauss_newton"
-    assert not found.is_consistent
-    assert any("it stopped before" in sentence for sentence in found.disagreements["steepest_descent"])
-
-
 def test_nothing_to_agree_on(repository, carried_out):
     config = repository / "configs" / "springs_series_ends.yaml"
     methods = "compare.methods={gauss_newton: {}, single_shooting: {max_iterations: 3}, "
@@ -208,7 +201,8 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
 def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     hidden = estimate(5.0, verdict="not_identifiable")
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
-    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
+    std = 0.1 if status == CONVERGED else 9.0  # one that stopped early may have any
+    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0, std))
     found = compared(one=best, two=other)
     said = f"gives other values than one, because {why}: a.b = 12.35 N m/rad (not 10), e = 3 N m/rad (not 2)"  # no ±
     assert found.disagreements == {"one": [], "two": [said]}

@@ -17,7 +17,6 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.pulse_detection import ForceEstimate
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
@@ -75,11 +74,6 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
         np.testing.assert_array_equal(group["before"], outcome.predicted_outputs[0])
         np.testing.assert_array_equal(group["after"], 2 * outcome.predicted_outputs[0])
         assert group["t"].shape == (len(group["measured"]),)
-
-
-def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", *solved_pendulum)
 
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
