@@ -11,7 +11,6 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals
-from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
@@ -160,18 +159,14 @@ def _checked_solution_and_step_stability(
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
     growths = {"estimate": growth(problem, solution.x), "start": begin}
-    found = {place: _growth_result(growths[place]) for place in ("start", "estimate")}
+    names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
+    found = {place: own and attributes_to_dict(own, names) for place, own in reversed(growths.items())}
     for place, own in growths.items():
         if own is not None and not own.keeps_errors_below_resolution:
             status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
             said = f"the simulation is unstable at the {place}, because {own.stability_message}"
             return replace(solution, status=status, message=f"{said}. Solver: {solution.message}"), found
     return solution, found
-
-
-def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
-    names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
-    return None if growth is None else attributes_to_dict(growth, names)
 
 
 _MEMORY_SUFFIX = ".memory"
