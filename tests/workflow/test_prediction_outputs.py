@@ -17,6 +17,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.diagnosis.pulse_detection import ForceEstimate
 from yid_ocp.effects import make_effect
+from yid_ocp.errors import OutputError
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs, problem_with_whitening_at
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
@@ -32,6 +33,8 @@ from yid_ocp.workflow.check import _fine_time_step, _input_noise, _too_stiff_sta
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
     problem, solution, held_out = solved_pendulum
     apart = [(held_out[0][0], "step 3 did not converge")]
+    with pytest.raises(OutputError, match="does not exist"):
+        prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", problem, solution, apart)
     prediction_outputs.write_solve_trajectories(tmp_path / "t.h5", problem, solution, apart)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
