@@ -59,13 +59,6 @@ def test_a_start_beyond_a_bound_is_refused_by_name(problem, start, said):
         estimation.solve(problem, initial_unknowns=start)
 
 
-def test_a_method_that_stops_early_is_said_to_differ(problem):
-    found = compare_methods(problem, [GaussNewton(), SteepestDescent(max_iterations=1)])
-    assert found.reference_method == "gauss_newton"
-    assert not found.is_consistent
-    assert any("it stopped before" in sentence for sentence in found.disagreements["steepest_descent"])
-
-
 def test_nothing_to_agree_on(repository, carried_out):
     config = repository / "configs" / "springs_series_ends.yaml"
     methods = "compare.methods={gauss_newton: {}, single_shooting: {max_iterations: 3}, "
@@ -208,7 +201,8 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
 def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     hidden = estimate(5.0, verdict="not_identifiable")
     best = found_by(a_b=estimate(10.0, 0.123), c=estimate(5.0, verdict="weak"), d=hidden, e=estimate(2.0, 0.1))
-    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0))
+    std = 0.1 if status == CONVERGED else 9.0  # one that stopped early may have any
+    other = found_by(status, cost, a_b=estimate(12.3456), c=estimate(99.0), d=estimate(9.0), e=estimate(3.0, std))
     found = compared(one=best, two=other)
     said = f"gives other values than one, because {why}: a.b = 12.35 N m/rad (not 10), e = 3 N m/rad (not 2)"  # no ±
     assert found.disagreements == {"one": [], "two": [said]}
@@ -296,6 +290,8 @@ def test_the_published_values_are_those_of_the_paper():
 class Means:
     """One unknown measured once by every recording, and the memory of one branch; without it predictions are off."""
 
+    options = ProblemOptions()
+
     def __init__(self, values, speeds, names=("k", "a.memory"), off=0.0):
         self.values, self.unknown_names, self.off = np.array(values, float), names, off
         self.shared_parameters = self.free = names
@@ -359,15 +355,13 @@ def solved(monkeypatch):
 )
 def test_nothing_is_asked_where_nothing_is_in_question(solved, names, speeds):
     problem, found = Means((1.0, 2.0, 3.0), speeds, names), fitted((2.0, 0.5), names)
-    chosen = choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())
+    chosen = choose_fit_with_or_without_shape_memory(problem, None, found)
     assert (chosen, solved.problems) == ((problem, found, ""), [])
 
 
 def test_a_single_recording_in_motion_bears_nothing_out(solved):
     moving = Means((1.0, 2.0, 3.0), (0.5, 0.0, None))
-    problem, found, message = choose_fit_with_or_without_shape_memory(
-        moving, None, fitted((2.0, 0.5)), ExcessResidualCriteria()
-    )
+    problem, found, message = choose_fit_with_or_without_shape_memory(moving, None, fitted((2.0, 0.5)))
     assert problem is solved.problems[0]
     assert (problem.unknown_names, found.x.tolist()) == (("k",), [2.0])
     assert "add a second recording that starts in motion" in message
@@ -390,7 +384,7 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     """Each from the others alone: the first from a mean of 4, the last from 1.5, wherever the fit of all stands."""
     problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
     problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
-    chosen, _, message = choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())
+    chosen, _, message = choose_fit_with_or_without_shape_memory(problem, None, found)
     missed = np.array(predicted) - [1.0, 6.0]
     with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (chosen is problem) is kept
@@ -401,12 +395,9 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
 def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
     problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
     problem.predictor.predict_episode = lambda *_: "it snaps"
-    assert (
-        "of inf times the noise"
-        in choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())[2]
-    )
+    assert "of inf times the noise" in choose_fit_with_or_without_shape_memory(problem, None, found)[2]
     solved.ok = False
-    assert choose_fit_with_or_without_shape_memory(problem, None, found, ExcessResidualCriteria())[1] is found
+    assert choose_fit_with_or_without_shape_memory(problem, None, found)[1] is found
 
 
 @pytest.mark.parametrize(("start", "window"), [("equilibrium", -1.0), ("fitted_to_points", 0.1)])

@@ -434,7 +434,3 @@ def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.Mo
         return validated_recording(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
 
     assert joints_of(read_any(tmp_path / "run.one", value=2.0)).position[0, 0] == 2.0
-
-
-def test_a_real_table_that_is_no_recording_is_refused(shared: Path) -> None:
-    refused(shared / "recordings" / "deft" / "bdlo1_undeformed.csv", "no column of times")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_examples import assert_same, changed, example, finite, joints_of, with_camera, with_joints
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validated_recording
+from yid_ocp.data.recording import JointGroup, Recording, validated_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -26,11 +26,6 @@ def test_arrays_are_copied_and_read_only_and_not_ragged() -> None:
     assert list(group.values_by_channel) == ["position", "effort"]
     with pytest.raises(DataError, match="not an array of numbers"):
         JointGroup(("a",), [0.0, 1.0], [[0.0], [1.0, 2.0]])  # type: ignore[arg-type]
-
-
-def test_one_number_for_std_is_spread_over_the_points() -> None:
-    group = PointGroup("points", ("a",), np.array([0.0, 1.0]), np.zeros((2, 1, 3)), std=0.01)  # type: ignore[arg-type]
-    assert np.array_equal(np.array(group.std), np.full((2, 1, 3), 0.01))
 
 
 def test_names_and_duration() -> None:

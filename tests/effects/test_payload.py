@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 from baxter import baxter_foam_y_system
 
+from yid_ocp.analysis.pinocchio_comparison import _assembled
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.effects.base import effort_limit_ratio_to_baxter, frame_names_at_arm_link_ends, one_frame_name_per_arm_link
 from yid_ocp.model import Mechanism, System
@@ -44,21 +46,14 @@ def mechanics(system: System):
     return ca.Function("mechanics", [q, v, system.parameters.symbols], [ca.densify(x) for x in outputs])
 
 
-def in_pinocchio(system: System, mass: float, point, pin):
+def in_pinocchio(system: System, mass: float, point):
     """The same arm with a point of some mass, negative or not, put on its last joint by Pinocchio."""
-    model, parent = pin.Model(), 0
-    model.gravity.linear[:] = [0.0, 0.0, -9.81]
-    for joint in system.mechanism.joints:
-        at = np.array(ca.DM(joint.placement.homogeneous_matrix()))
-        parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(*joint.axis), pin.SE3(at), joint.name)
-        body = merge_inertias(joint.bodies)
-        com, tensor = (np.array(ca.DM(x)) for x in (body.center_of_mass, body.inertia_about_com))
-        model.appendBodyToJoint(parent, pin.Inertia(float(body.mass), com.ravel(), tensor), pin.SE3.Identity())
-    own = model.inertias[parent]
+    model = _assembled(system.mechanism, np.array([0.0, 0.0, -9.81]), weight=True)
+    own = model.inertias[model.njoints - 1]
     whole, centre = own.mass + mass, (own.mass * own.lever + mass * np.array(point)) / (own.mass + mass)
     apart = np.array(point) - own.lever
     tensor = own.inertia + own.mass * mass / whole * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-    model.inertias[parent] = pin.Inertia(whole, centre, tensor)
+    model.inertias[model.njoints - 1] = pin.Inertia(whole, centre, tensor)
     return model
 
 
@@ -66,12 +61,11 @@ def in_pinocchio(system: System, mass: float, point, pin):
     ("mass", "point"), [(0.33, (-0.1, 0.2, 0.4)), (2.5, (0.1, 0.3, 0.2)), (-0.35, (0.01, -0.03, 0.2))]
 )
 def test_inverse_dynamics_are_those_of_a_point_on_the_link(mass, point) -> None:
-    pin = pytest.importorskip("pinocchio", reason="the other library is Pinocchio: pip install pin")
     nominal = arm()
     moment = mass * TURNED[:3, :3].T @ (np.array(point) - TURNED[:3, 3])
     values = dict(zip(("mass", "mx", "my", "mz"), (mass, *moment), strict=True))
     system = nominal.with_effects([make_effect("payload", "hand", nominal, values)])
-    model = in_pinocchio(nominal, mass, point, pin)
+    model = in_pinocchio(nominal, mass, point)
     data, rng, theta = model.createData(), np.random.default_rng(2), system.parameters.vector()
     found = mechanics(system)
     for _ in range(3):

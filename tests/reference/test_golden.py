@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.mechanism import merge_inertias
 
@@ -18,40 +17,24 @@ def case(request, golden, paper_systems, theta_golden, single_step, dual_step):
     return golden(request.param), paper_systems[request.param], step, theta_golden(request.param)
 
 
-def compare_step(trep, step, theta, k):
-    q1, p1, lam, status = step(trep.q[k], trep.p[k], trep.u[k], theta)
-    assert status.is_converged, status.message
-    np.testing.assert_allclose(q1, trep.q[k + 1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(p1, trep.p[k + 1], rtol=0, atol=1e-9)
-    # trep was given pi as the URDF rounds it (to 5e-12), which shows in small multipliers: relative to the largest one
-    np.testing.assert_allclose(lam, trep.lam[k], rtol=0, atol=1e-8 * np.max(np.abs(trep.lam)))
-
-
-def compare_derivatives(trep, step, theta, k):
-    A, B_u, B_theta = step.jacobians(trep.q[k], trep.p[k], trep.u[k], theta, names=())
-    for actual, expected in ((A, getattr(trep, f"A_{k}")), (B_u, getattr(trep, f"Bu_{k}"))):
-        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
-    assert B_theta.shape == (2 * step.system.n_coordinates, 0)
-
-
 def test_every_step(case):
     trep, _, step, theta = case
     for k in range(len(trep.u)):
-        compare_step(trep, step, theta, k)
+        q1, p1, lam, status = step(trep.q[k], trep.p[k], trep.u[k], theta)
+        assert status.is_converged, status.message
+        np.testing.assert_allclose(q1, trep.q[k + 1], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(p1, trep.p[k + 1], rtol=0, atol=1e-9)
+        # trep was given pi as the URDF rounds it (to 5e-12), which shows in small multipliers: relative to the largest
+        np.testing.assert_allclose(lam, trep.lam[k], rtol=0, atol=1e-8 * np.max(np.abs(trep.lam)))
 
 
 @pytest.mark.parametrize("k", [0, 10, 299])
 def test_first_derivatives(case, k):
     trep, _, step, theta = case
-    compare_derivatives(trep, step, theta, k)
-
-
-def test_interpreter(golden, single_arm, theta_golden):
-    trep, theta = golden("single"), theta_golden("single")
-    step = compile_step(single_arm, 0.01, "left", "node", use_compiler=False)
-    for k in (0, 299):
-        compare_step(trep, step, theta, k)
-    compare_derivatives(trep, step, theta, 10)
+    A, B_u, B_theta = step.jacobians(trep.q[k], trep.p[k], trep.u[k], theta, names=())
+    for actual, expected in ((A, getattr(trep, f"A_{k}")), (B_u, getattr(trep, f"Bu_{k}"))):
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    assert B_theta.shape == (2 * step.system.n_coordinates, 0)
 
 
 def test_measured_points(case):

@@ -1,18 +1,16 @@
-"""Kinematics, mass matrix, gravity and inverse dynamics against Pinocchio, joints and frames matched by name."""
-
-from dataclasses import dataclass
+"""Kinematics, energies, mass matrix, gravity and inverse dynamics against Pinocchio, joints and frames by name."""
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from yid_ocp.model import Mechanism, forward_kinematics
+from yid_ocp.analysis.pinocchio_comparison import compare_urdf_with_pinocchio
+from yid_ocp.model import forward_kinematics
 from yid_ocp.model import mechanism as mechanism_module
-from yid_ocp.model.kinematics import lagrangian_first_derivatives, lagrangian_second_derivatives, mass_matrix
+from yid_ocp.model.kinematics import lagrangian_first_derivatives
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
-
-pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
 
 GRAVITY = np.array([0.4, -0.3, -9.81])
 TOLERANCE = 1e-10
@@ -31,120 +29,64 @@ ROBOTS = {
 }
 
 
-@dataclass(frozen=True)
-class Twin:
-    """The same mechanism here and in Pinocchio."""
-
-    mechanism: Mechanism
-    model: object
-
-    def functions(self):
-        n = len(self.mechanism.joints)
-        q, v, a = (ca.SX.sym(name, n) for name in "qva")
-        kinematics = forward_kinematics(self.mechanism, q)
-        rigid = lagrangian_first_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
-        by_qv = lagrangian_second_derivatives(rigid, self.mechanism)[1]
-        M = mass_matrix(rigid, self.mechanism)
-        effort = M @ a + by_qv.T @ v - rigid.lagrangian_by_q
-        frames = list(self.mechanism.frames)
-        poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in frames]
-        by_q = [(kinematics.position_jacobian(name), kinematics.angular_jacobian(name)) for name in frames]
-        jacobians = [ca.vertcat(*pair) for pair in by_q]
-        values = [M, rigid.lagrangian_by_q, effort, ca.dot(v, rigid.lagrangian_by_v) / 2, rigid.potential_energy]
-        dynamics = ca.Function("dynamics", [q, v, a], values)
-        return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
-
-    @property
-    def columns(self) -> list[int]:
-        """Velocity index in Pinocchio of each of our coordinates."""
-        return [self.model.joints[self.model.getJointId(name)].idx_v for name in self.mechanism.joint_names]
-
-    def configuration(self, q) -> np.ndarray:
-        """Pinocchio's q, in which a continuous joint is a cosine and a sine."""
-        result = pin.neutral(self.model)
-        for name, value in zip(self.mechanism.joint_names, q, strict=True):
-            joint = self.model.joints[self.model.getJointId(name)]
-            result[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-        return result
-
-    def tangent(self, v) -> np.ndarray:
-        result = np.zeros(self.model.nv)
-        result[self.columns] = v
-        return result
-
-
-@pytest.fixture(scope="module", params=list(ROBOTS))
-def twin(request, urdf_folder):
+@pytest.fixture(params=list(ROBOTS))
+def robot(request, urdf_folder, monkeypatch):
     """Read without rounding nearly exact entries, which Pinocchio does not do either."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mechanism_module, "_SNAP_TOLERANCE", 0.0)
-        return make_twin(urdf_folder, *ROBOTS[request.param])
-
-
-def make_twin(urdf_folder, file, joints, locked):
+    monkeypatch.setattr(mechanism_module, "_SNAP_TOLERANCE", 0.0)
+    file, joints, locked = ROBOTS[request.param]
     if file is None:
-        path = urdf_folder / "y_object.urdf"
-    elif file.startswith("package:"):
-        path = urdf_path_from_robot_name(file)
-    else:
-        path = urdf_folder / file
-    if file is None:
-        mechanism = foam_y_object().mechanism.with_numeric_values()
-    else:
-        mechanism = read_urdf(path, joints=joints, locked=locked).with_numeric_values()
-    full = pin.buildModelFromUrdf(str(path))
-    full.gravity.linear = GRAVITY
-    if joints is None:
-        return Twin(mechanism, full)
-    whole = Twin(read_urdf(path).with_numeric_values(), full)
-    values = [locked.get(name, 0.0) for name in whole.mechanism.joint_names]
-    out = [i for i in range(1, full.njoints) if full.names[i] not in joints]
-    return Twin(mechanism, pin.buildReducedModel(full, out, whole.configuration(values)))
+        return urdf_folder / "y_object.urdf", foam_y_object().mechanism.with_numeric_values(), joints, locked
+    path = urdf_path_from_robot_name(file) if file.startswith("package:") else urdf_folder / file
+    return path, read_urdf(path, joints=joints, locked=locked).with_numeric_values(), joints, locked
 
 
-def states(twin, count, seed):
-    rng = np.random.default_rng(seed)
-    n = len(twin.mechanism.joints)
-    for _ in range(count):
-        yield rng.uniform(-1.5, 1.5, n), rng.normal(size=n), rng.normal(size=n)
+def configuration(model, values) -> np.ndarray:
+    """Pinocchio's q, in which a continuous joint is a cosine and a sine."""
+    result = pin.neutral(model)
+    for name, value in values.items():
+        joint = model.joints[model.getJointId(name)]
+        result[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+    return result
 
 
 def close(actual, expected, scale=1.0):
     assert np.max(np.abs(actual - expected), initial=0.0) <= TOLERANCE * max(1.0, scale)
 
 
-def test_frames_and_their_jacobians(twin):
-    frames, poses, jacobians, _ = twin.functions()
-    data = twin.model.createData()
-    for q, _, _ in states(twin, 3, seed=1):
-        pin.computeJointJacobians(twin.model, data, twin.configuration(q))
-        pin.updateFramePlacements(twin.model, data)
-        for name, pose, jacobian in zip(frames, poses.call([q]), jacobians.call([q]), strict=True):
-            assert twin.model.existFrame(name) or name == "object_root"
-            if not twin.model.existFrame(name):
+def test_frames_their_jacobians_and_energies(robot):
+    path, mechanism, joints, locked = robot
+    model, names = pin.buildModelFromUrdf(str(path)), mechanism.joint_names
+    if joints is not None:
+        out = [i for i in range(1, model.njoints) if model.names[i] not in joints]
+        model = pin.buildReducedModel(model, out, configuration(model, locked))
+    model.gravity.linear = GRAVITY
+    columns = [model.joints[model.getJointId(name)].idx_v for name in names]
+    data, n, rng = model.createData(), len(names), np.random.default_rng(1)
+    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    kinematics = forward_kinematics(mechanism, q)
+    rigid = lagrangian_first_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
+    energies = ca.Function("energies", [q, v], [ca.dot(v, rigid.lagrangian_by_v) / 2, rigid.potential_energy])
+    for here, speed in zip(rng.uniform(-1.5, 1.5, (3, n)), rng.normal(size=(3, n)), strict=True):
+        at, there = configuration(model, dict(zip(names, here, strict=True))), np.zeros(n)
+        there[columns] = speed
+        pin.computeJointJacobians(model, data, at)
+        pin.updateFramePlacements(model, data)
+        for name in mechanism.frames:
+            assert model.existFrame(name) or name == "object_root"
+            if not model.existFrame(name):
                 continue
-            index = twin.model.getFrameId(name)
-            close(np.array(pose), data.oMf[index].homogeneous)
-            reference = pin.getFrameJacobian(twin.model, data, index, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-            close(np.array(ca.densify(jacobian)), reference[:, twin.columns])
+            index = model.getFrameId(name)
+            jacobian = ca.vertcat(kinematics.position_jacobian(name), kinematics.angular_jacobian(name))
+            frame = ca.Function("frame", [q], [kinematics.frame_pose(name).homogeneous_matrix(), jacobian])
+            pose, by_q = (np.array(ca.densify(part)) for part in frame(here))
+            close(pose, data.oMf[index].homogeneous)
+            reference = pin.getFrameJacobian(model, data, index, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            close(by_q, reference[:, columns])
+        energy = pin.computeKineticEnergy(model, data, at, there), pin.computePotentialEnergy(model, data, at)
+        close(np.array(energies(here, speed)).ravel(), energy, min(map(abs, energy)))
 
 
-def test_mass_matrix_gravity_and_inverse_dynamics(twin):
-    _, _, _, dynamics = twin.functions()
-    data = twin.model.createData()
-    order = np.ix_(twin.columns, twin.columns)
-    for q, v, a in states(twin, 5, seed=2):
-        at, speed, acceleration = twin.configuration(q), twin.tangent(v), twin.tangent(a)
-        M, _, effort, kinetic, potential = (np.array(ca.densify(x)).squeeze() for x in dynamics.call([q, v, a]))
-        at_rest = np.array(dynamics.call([q, 0 * v, a])[1]).ravel()
-        upper = np.triu(pin.crba(twin.model, data, at))
-        reference = upper + np.triu(upper, 1).T
-        close(M, reference[order], np.max(np.abs(reference)))
-        weight = pin.computeGeneralizedGravity(twin.model, data, at)[twin.columns]
-        close(-at_rest, weight, np.max(np.abs(weight)))
-        needed = pin.rnea(twin.model, data, at, speed, acceleration)[twin.columns]
-        close(effort, needed, np.max(np.abs(needed)))
-        energy = pin.computeKineticEnergy(twin.model, data, at, speed)
-        close(kinetic, energy, abs(energy))
-        height = pin.computePotentialEnergy(twin.model, data, at)
-        close(potential, height, abs(height))
+def test_mass_matrix_gravity_and_inverse_dynamics(robot):
+    path, mechanism, joints, locked = robot
+    found = compare_urdf_with_pinocchio(path, mechanism, GRAVITY, joints, locked)
+    assert max(found.mass, found.weight, found.motion) <= TOLERANCE

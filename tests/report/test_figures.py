@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import OutputError
 from yid_ocp.model.flexible import FlexibleSegment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -276,12 +275,6 @@ def test_patterns_stand_beside_each_other_and_empty_ones_are_left_out(drawn, tmp
     empty = SparsityPattern("B_u", "no torque", np.zeros((6, 0), bool), empty.row_blocks, (), empty.row_labels, ())
     draw_sparsity_patterns(tmp_path / "p.png", [[pattern(), pattern(6, 12)], [empty], [pattern(9, 5), empty]])
     assert [shown(axes).shape for axes in drawn[0].get_axes()] == [(6, 8), (6, 12), (9, 5)]
-
-
-def test_a_picture_that_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(OutputError, match="does not exist") as caught:
-        draw_sparsity_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
-    assert str(tmp_path / "nowhere") in str(caught.value.where)
 
 
 def test_values_of_very_different_sizes_get_a_logarithmic_axis():

@@ -6,7 +6,6 @@ import html
 import importlib
 import itertools
 import json
-import logging
 import re
 import shlex
 import shutil
@@ -171,14 +170,6 @@ def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monke
 def test_every_template_has_its_section(repository):
     templates = {path.stem for path in (repository / "yid_ocp" / "report" / "templates").glob("*.html")}
     assert templates - {"page", "blocks", "figures"} < set(REPORT_SECTIONS)
-
-
-def test_without_the_extra_there_is_a_notice_and_no_report(solved_pendulum, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("yid_ocp.report.html.util.find_spec", lambda name: None)
-    with caplog.at_level(logging.WARNING):
-        assert not write_report(tmp_path / "r.html", findings(solved_pendulum))
-    assert ".[report]" in caplog.text
-    assert not (tmp_path / "r.html").exists()
 
 
 def test_a_report_that_cannot_be_written(solved_pendulum, tmp_path):

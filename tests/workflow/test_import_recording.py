@@ -81,11 +81,8 @@ GOOD = "t,q_a,tip_x,tip_y,tip_z\n0,0.1,1,1,1\n1,0.2,1,1,1\n"
 BAD: dict[str, tuple[str, str | None, str, str]] = {
     # file, its text (None: there is no such file), flags, what is said
     "no such file": ("run.csv", None, "", "no such file"),
-    "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
     "no name to write to": ("run.csv", GOOD, "--out", "the option --out is missing"),
     "the name of the file that is read": ("run.csv", GOOD, "--out run.csv", "'run.csv' does not end in .h5"),
-    "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
-    "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
     "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),
     "bad lines alone": ("run.csv", "t,q_a\n0,x\n", "--skip-bad-lines", "no rows"),
     "an unknown unit": ("run.csv", GOOD, "--units furlong", "the unit 'furlong' is unknown"),

@@ -33,6 +33,8 @@ from yid_ocp.workflow.check import _fine_time_step, _input_noise, _too_stiff_sta
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
     problem, solution, held_out = solved_pendulum
     apart = [(held_out[0][0], "step 3 did not converge")]
+    with pytest.raises(OutputError, match="does not exist"):
+        prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", problem, solution, apart)
     prediction_outputs.write_solve_trajectories(tmp_path / "t.h5", problem, solution, apart)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
@@ -75,11 +77,6 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
         np.testing.assert_array_equal(group["before"], outcome.predicted_outputs[0])
         np.testing.assert_array_equal(group["after"], 2 * outcome.predicted_outputs[0])
         assert group["t"].shape == (len(group["measured"]),)
-
-
-def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", *solved_pendulum)
 
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):

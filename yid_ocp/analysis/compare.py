@@ -10,12 +10,10 @@ from dataclasses import dataclass, replace
 from yid_ocp.analysis import estimation
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.inference import uncertainty
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.inference.whitening import problem_with_exact_inputs
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodeAndPredictionOrFailure
-from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, fit_problem
 from yid_ocp.solvers.base import Solver, StopSearch, uses_process_noise_covariance
 
@@ -61,7 +59,6 @@ def compare_methods(
     problem: EstimationProblem,
     solvers: Sequence[Solver],
     callback: Callable[[str, Iterate], None] | None = None,
-    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     total_time_budget: float = math.inf,
 ) -> MethodsComparisonResult:
     """Run several estimation methods (`solvers`) from the same initial values and compare their estimates.
@@ -69,11 +66,11 @@ def compare_methods(
     Steepest descent minimises the published cost (points in metres, no noise levels, no weak prior). The other methods
     minimise the problem's cost without process noise, because not every method supports it. If the problem has process
     noise, these estimates are marked `not_trusted`, and the verdicts come from an additional run that includes it.
-    `callback` receives the method's name and every `Iterate`. `limits` states when a residual exceeds noise. Each
-    method gets an equal part of the remaining `total_time_budget` [s].
+    `callback` receives the method's name and every `Iterate`. Each method gets an equal part of the remaining
+    `total_time_budget` [s].
     """
     runs, whole, problem = [], problem, problem_with_exact_inputs(problem)
-    deadline = time.perf_counter() + total_time_budget
+    limits, deadline = problem.options.excess_residual_criteria, time.perf_counter() + total_time_budget
 
     def listener(name: str, share: float = math.inf) -> Callable[[Iterate], None]:
         begun = time.perf_counter()

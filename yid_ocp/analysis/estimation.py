@@ -11,7 +11,6 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.clock_checks import clock_and_noise_issues_from_residuals
-from yid_ocp.analysis.discretisation import AlternatingErrorGrowth
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
@@ -25,7 +24,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
 from yid_ocp.problem.estimation_problem import checked_unknowns, held_out_prediction_arguments
 from yid_ocp.problem.measurements import SensorMeasurements, measurements_minus_sensor_error_estimates
-from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_count_dicts_by_channel
 from yid_ocp.sensors.base import Sensor
 from yid_ocp.solvers import GaussNewton, Solution, Status
@@ -70,7 +68,7 @@ def solve(
         text += f" (noise alone gives a cost near {noise_cost:.4g})"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
     found = solvers.fit_problem(problem, solver, initial_unknowns, callback, limits)
-    problem, found, message = choose_fit_with_or_without_shape_memory(problem, solver, found, limits)
+    problem, found, message = choose_fit_with_or_without_shape_memory(problem, solver, found)
     solution = add_intervals_and_checks(problem, found, progress)
     checks = replace(solution.checks or uncertainty.EstimateChecksBeyondFit(), cable_memory_message=message)
     return replace(solution, checks=checks)
@@ -161,18 +159,14 @@ def _checked_solution_and_step_stability(
     growth = discretisation.alternating_error_growth_of_worst_recording
     begin = growth(start, start.initial_unknowns) if solution.status == Status.FAILED else None
     growths = {"estimate": growth(problem, solution.x), "start": begin}
-    found = {place: _growth_result(growths[place]) for place in ("start", "estimate")}
+    names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
+    found = {place: own and attributes_to_dict(own, names) for place, own in reversed(growths.items())}
     for place, own in growths.items():
         if own is not None and not own.keeps_errors_below_resolution:
             status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
             said = f"the simulation is unstable at the {place}, because {own.stability_message}"
             return replace(solution, status=status, message=f"{said}. Solver: {solution.message}"), found
     return solution, found
-
-
-def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
-    names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
-    return None if growth is None else attributes_to_dict(growth, names)
 
 
 _MEMORY_SUFFIX = ".memory"
@@ -182,7 +176,7 @@ _MIN_MOVING_RECORDINGS = 2  # minimum for leave-one-out predictions
 
 
 def choose_fit_with_or_without_shape_memory(
-    problem: EstimationProblem, solver: Solver, solution: Solution, limits: ExcessResidualCriteria
+    problem: EstimationProblem, solver: Solver, solution: Solution
 ) -> tuple[EstimationProblem, Solution, str]:
     """Decide whether to keep the cable's shape memory in the fit, if the cable already moves when a recording starts.
 
@@ -197,7 +191,7 @@ def choose_fit_with_or_without_shape_memory(
     moving = [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
     if not _memory_parameters(problem) or not moving or solution.evaluation is None:
         return problem, solution, ""
-    without = problem_without_shape_memory(problem)
+    without, limits = problem_without_shape_memory(problem), problem.options.excess_residual_criteria
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
     other = solvers.fit_problem(without, solver, without.pack_unknowns(known).tolist(), limits=limits)
     if other.evaluation is None:

@@ -23,13 +23,11 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, failed_rollout_error, require_known_names
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import residual_and_jacobian_with_stated_priors
-from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.estimation_problem import checked_unknowns
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.options import ExcessResidualCriteria
 from yid_ocp.solvers.base import Solution
 
 InitialStateKnowledge = Literal["assumed", "unknown"]
@@ -116,7 +114,6 @@ def identifiability(
     start: InitialStateKnowledge = "assumed",
     grasp_std: float | None = None,
     intervals: Iterable[str] | Literal["all"] = (),
-    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     progress: Progress = NULL_PROGRESS,
 ) -> IdentifiabilityResult:
     """Determine by the Fisher information which free parameters the recordings identify.
@@ -139,8 +136,6 @@ def identifiability(
         which are then also estimated; default: grasps are known.
     intervals : iterable of str, or "all"
         Parameters for which a profile-likelihood interval is computed.
-    limits : ExcessResidualCriteria, optional
-        Criteria by which a residual at a solution exceeds noise.
     """
     names = uncertainty.parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
@@ -162,7 +157,7 @@ def identifiability(
         else:
             own = wide if as_solved else problem_with_whitening_at(problem, given, rounds=2)
             solved = evaluation if as_solved else own.evaluate(given)
-            fit = uncertainty.assess_goodness_of_fit(own, solved, limits, given)
+            fit = uncertainty.assess_goodness_of_fit(own, solved, problem.options.excess_residual_criteria, given)
             covariance = uncertainty.misfit_robust_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
         judged = uncertainty.parameter_estimates(wide, x, evaluation, covariance, fit)

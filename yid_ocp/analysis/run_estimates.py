@@ -82,7 +82,6 @@ class _RunOutlierTest:
 class DriftAndOutlierTestResults:
     """Tests of several runs for drifting parameters and outlier runs. `chi2` tests all parameters and runs at once."""
 
-    run_names: tuple[str, ...]
     parameter_drift_tests: tuple[_ParameterDriftTest, ...]
     run_outlier_tests: tuple[_RunOutlierTest, ...]
     chi2: float
@@ -141,8 +140,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     mean, chi2, degrees = pool_estimates_and_chi2(runs)
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
-    names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
-    return DriftAndOutlierTestResults(names, drifts, against, chi2, degrees, p, level)
+    return DriftAndOutlierTestResults(drifts, against, chi2, degrees, chi2_p_value(chi2, degrees), level)
 
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDriftTest:

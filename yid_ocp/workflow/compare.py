@@ -44,8 +44,8 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
-        limits, budget = run.diagnosis.fit_excess_residual_criteria, run.compare.total_time_budget
-        comparison = compare_methods(problem, solvers, iterate, limits, math.inf if budget is None else budget)
+        budget = run.compare.total_time_budget
+        comparison = compare_methods(problem, solvers, iterate, math.inf if budget is None else budget)
         judged = comparison.verdict_solution
         own, checks = judged.problem or problem, judged.checks or EstimateChecksBeyondFit()
         held_out = checks.held_out_predictions

@@ -96,7 +96,6 @@ def run_identifiability(
             free = free_parameter_names(run, system.parameters)
             require_known_names(wanted, free, "free parameter", "--intervals (else `all` or `none`)", ConfigError)
         problem = whole = build_problem(run, build_step(run, system_with_grasp_offset_effects(system)))
-        limits = run.diagnosis.fit_excess_residual_criteria
         solution = None
         if asked.evaluation_point == "solution":
             problem, solution = solve_and_choose_cable_shape_memory(run, problem, folder, progress)
@@ -115,7 +114,7 @@ def run_identifiability(
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.begin_stage("computing the Fisher information")
-            judged = partial(fisher.identifiability, problem, solution, limits=limits)
+            judged = partial(fisher.identifiability, problem, solution)
             unknown = judged(start="unknown", grasp_std=fisher.GRASP_OFFSET_PRIOR_STD)
             judged = partial(judged, **knowledge)
             information = judged()
@@ -234,9 +233,9 @@ class _IdentifiabilityTasks:
 
 def _profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
-    run, problem = _problem(common)
-    start, std, limits = common["start"], common["grasp_std"], run.diagnosis.fit_excess_residual_criteria
-    found = fisher.identifiability(problem, common["x"], intervals=[name], limits=limits, start=start, grasp_std=std)
+    _, problem = _problem(common)
+    start, std = common["start"], common["grasp_std"]
+    found = fisher.identifiability(problem, common["x"], intervals=[name], start=start, grasp_std=std)
     return dict(to_lossless_plain_data({"parameter": found.parameters[name], "profile": found.profiles[name]}))
 
 

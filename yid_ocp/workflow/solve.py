@@ -78,7 +78,7 @@ def solve_and_choose_cable_shape_memory(
     progress.begin_stage(f"solving by {run.solver.name}")
     limits = problem.options.excess_residual_criteria
     found = solvers.fit_problem(problem, run.solver, callback=_iterate_logger(problem, folder, progress), limits=limits)
-    return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found, limits)[:2]
+    return estimation.choose_fit_with_or_without_shape_memory(problem, run.solver, found)[:2]
 
 
 def _iterate_logger(
