@@ -338,7 +338,8 @@ def _calming(scene: MujocoModelAndState, held: Any) -> Iterator[float]:
         if lost := _lost(scene):
             what = "the simulation diverged before the motion began, "
             what += f"within {done * every:.3g} s of settling with time steps of {held.opt.timestep:g} s"
-            hint = "begin nearer to the grasp (initial_joint_angles), or simulate with a shorter time step"
+            hint = "simulate with a shorter time step"
+            hint += ", or begin nearer to the grasp (initial_joint_angles)" * bool(held.neq)
             raise ModelError(what, where=f"MuJoCo, {lost}", allowed="finite positions and velocities", hint=hint)
         yield (calm := float(np.abs(data.qvel).max()))
         step(held, data, nstep=block)
