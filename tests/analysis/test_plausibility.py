@@ -644,11 +644,12 @@ def springs(repository):
     return run, build_problem(run)
 
 
-def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0, **criteria):
+def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0, gain=1.0, **criteria):
     """Doubts after a fit of the recording on another clock, with a slow error, or another noise in the settings."""
     run, problem = springs
     recording = problem.episodes[0].recording
-    group = recording.points[0]
+    turned = replace(recording.joints, position=gain * recording.joints.position)
+    recording, group = replace(recording, joints=turned), recording.points[0]
     error = slow * np.sin(2 * np.pi * (group.t - group.t[0]) / np.ptp(group.t))[:, None, None]
     moved = replace(group, t=group.t + late + drift * (group.t - group.t.mean()), position=group.position + error)
     inside = (moved.t >= recording.joints.t[0]) & (moved.t <= recording.joints.t[-1])
@@ -665,6 +666,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0, **criteria):
 def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):
     assert doubts(springs) == []
     assert "clock_drift" not in {doubt.cause for doubt in doubts(springs, late=0.1)}
+    assert doubts(springs, gain=1.1) == [], "wrong angles are no clock that runs apart"
     (doubt,) = doubts(springs, late=0.6)  # beyond the linear model, in which it would be a drift as well
     told = float(re.search(r"about (\d+) ms late", doubt.what)[1])
     assert (doubt.cause, told) == ("clock_offset", pytest.approx(600.0, rel=0.05))

@@ -327,7 +327,7 @@ def _clocks(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
                 words = f"time stamps of {group.name} are about {_lateness_text(late)} on the joints' clock"
                 advice = f"add {-late:+.3g} s to their times, and repeat this command"
                 yield Issue("clock_offset", words, "not_trusted", abs(late) / limit, advice, "", group.name, "t")
-            else:
+            elif abs(error.drift) <= _MAX_DRIFT:  # a larger one is the sign of another error, such as a wrong scale
                 yield _drift_issue(error, group.name, limit, "not_trusted", len(episode.measurements) > 1)
 
 
