@@ -15,7 +15,7 @@ def assert_nothing_impossible_is_said(finding: DiagnosisResult, text: str) -> No
         assert residuals_exceed_noise(tests, finding.thresholds.null_test_excess_criteria), text
     if finding.verdict == "no_gap" and not finding.residual_exceeds_noise(finding.thresholds):
         is_significant = min(test.p_value for test in tests) < finding.thresholds.significance_level
-        assert ("but does not count as a gap" in text) == is_significant
+        assert ("but too small for a gap" in text) == is_significant
     if finding.verdict in ("no_gap", "insufficient_data"):
         assert "an error beyond noise (a gap)" not in text
         assert not finding.accepted_effects

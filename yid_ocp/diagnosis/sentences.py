@@ -154,14 +154,15 @@ def _why_no_gap(result: DiagnosisResult) -> list[str]:
     limits, tests = result.thresholds, (result.nominal_test, result.nominal_held_out_test)
     (best, along), least = _best_candidate(result), 1 + limits.min_excess_chi2_per_dof
     p_value = min(test.p_value for test in tests)
-    chance = p_value_text(p_value, "= ")
-    small = f"The error is significantly larger than noise (p {chance}), but does not count as a gap."
     level = limits.gap_significance_level / len(tests)
-    needs = f"A gap needs both chi2 per degree of freedom above {least:.4g} and p below {level:.2g}."
+    small = (
+        f"The error is larger than noise (p {p_value_text(p_value, '= ')}), but too small for a gap, which needs chi2 "
+    )
+    small += f"per degree of freedom above {least:.4g} and p below {level:.2g}."
     seen = f"The error has the pattern of {best} (p {p_value_text(along, '= ')} if there is only noise)"
     narrow = f"{seen}, but this effect was not accepted as a cause, so there is no gap."
     unseen = result.screening.undetectable_labels
-    lines = _said((p_value < limits.significance_level, f"{small} {needs}")) + _hidden_changes(result)
+    lines = _said((p_value < limits.significance_level, small)) + _hidden_changes(result)
     return lines + _said((along < limits.gap_significance_level, narrow), (unseen, unseen_effects_sentence(unseen)))
 
 
