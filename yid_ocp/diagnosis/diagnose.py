@@ -360,8 +360,10 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         search, nominal, limits = seen.search, seen.nominal, seen.search.thresholds
         shifted = earlier.shifted_parameters_with_prior(nominal, limits)
         evidence = replace(seen.evidence, has_left_baseline=bool(shifted))
+        # beside the prior of a changed parameter, a finer model may only imitate the change
+        checked = search if shifted else replace(search, check_discretisation=partial(_check_discretisation, seen))
         try:
-            judged = judge(replace(search, check_discretisation=partial(_check_discretisation, seen)), evidence)
+            judged = judge(checked, evidence)
         except _FinerModelExplainsError as found:
             seen = found.examined
             continue
