@@ -28,7 +28,8 @@ SOLVE_KEYS = {
         "covariance", "refinement_notes", "finer_settings", "stability",
     "issues", "torque_offsets", "to_use", "unused_efforts",
 }  # fmt: skip
-PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval", "meaning"}
+PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
+PARAMETER_KEYS |= {"meaning", "prior_std"}
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["--version"]])

@@ -315,6 +315,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         ("timestamp,actual_q_0,actual_qd_0,target_q_0", "t position:0 velocity:0 position_command:0"),
         ("time [µs],q_a [°],/ft/wrench/torque/x", "t position:a None"),
         ("Time (s),Rail Position (m),Rail Force (N),Tip Force (N)", "t position:Rail effort:Rail None"),
+        ("t,lift.q_mm,lift.qd_mm_s,lift.F_N", "t position:lift velocity:lift effort:lift"),
         ("t,tip X,tip Y,tip Z", "t x:tip y:tip z:tip"),
         ("t,tip_x [mm],tip_y [mm],tip_z [mm]", "t x:tip y:tip z:tip"),
         ("t,x,y,z", "t x:marker y:marker z:marker"),

@@ -100,12 +100,16 @@ def test_a_solve_says_what_is_not_found():
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
     assert "Fix p there (parameters.p.free: false) if it is absent" in " ".join(gone.split())
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
-    issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning")
+    issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning") | {"evidence": 2.0}
     issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}
     both = {"a": parameter("not_identifiable") | {"std": None, "upper": 2.0}, "b": parameter("identifiable")}
     lines = told("yid-solve/1", solved(parameters=both, issues=[issue]))
     said = " ".join(lines)
     assert ("Fix a at a known value" in said, "a (motion too weak). `yid-ocp" in said) == (True, True)
+    clamp = {"mount.rx": parameter("weak") | {"prior_std": 0.05, "initial": 0.0}, "b": parameter("identifiable")}
+    said = " ".join(told("yid-solve/1", solved(parameters=clamp, issues=[issue | {"evidence": 1.0}])))
+    assert "Corrections that are not known to within 10 %: mount.rx." in said
+    assert ("Only weakly" in said, "Before you use" in said, "estimate again" in said) == (False,) * 3
     more = [issue | {"where": place, "setting": f"parameters.{place}.free: false"} for place in "bcd"]
     many = told("yid-solve/1", solved(parameters=both, issues=[issue, *more]))
     assert ("Issues:" in lines, "Issues:" in many, "warning, b, c, d (warning): " in " ".join(many)) == (
@@ -149,7 +153,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     lost = {"k": parameter("not_identifiable", 1.29e6) | {"initial": 1.3e6}, "b": parameter("not_identifiable")}
     for name, fraction in (("k", 1.0), ("b", 0.1)):
         still = {"cause": "weak_excitation", "setting": f"parameters.{name}.free: false", "where": "", "certainty": ""}
-        issues = [still | {"severity": "warning", "advice": "fix it", "what": ""}]
+        issues = [still | {"severity": "warning", "evidence": 2.0, "advice": "fix it", "what": ""}]
         fit = BAD | {"noise_fraction": fraction}
         text = " ".join(told("yid-solve/1", solved(fit=fit, parameters=lost, issues=issues)))
         assert ("start values of k (1.3e+06 N m/rad): near them" in text) == (name == "b"), "k does not move"
@@ -361,6 +365,7 @@ def test_the_next_command_of_check_follows_the_advice():
     """Effects stay out of it, as the option would replace those of the configuration."""
     own = {"recording": "a", "role": "estimate", "groups": {}, "noise": {}, "grasp_gaps": {}}
     issue = dict.fromkeys(("where", "what", "advice"), "x") | {"certainty": "likely", "severity": "warning"}
+    issue["evidence"] = 2.0
     issue |= {"cause": "noise_overstated", "setting": "sensors.camera.std: 0.001"}
     found = {"warnings": ["too coarse"], "links": [], "time_step": [], "message": ""}
     result = {"warnings": [], "convergence": found, "recordings": [own], "mechanics": {}}

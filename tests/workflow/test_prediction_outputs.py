@@ -283,7 +283,7 @@ def test_what_is_found_at_a_joint_of_a_robot_is_a_line_that_mujoco_reads(robot):
     found["elbow.damping[run1]"] = found["elbow.damping"]  # of one recording
     assert copied(system, values, **{"elbow.damping[run1]": found["elbow.damping"]})["yaml"] == []
     [stiff] = copied(system, values, **{"elbow.stiffness": found["elbow.stiffness"]}, **lost)["mjcf"]
-    assert ('stiffness="4"' in stiff, "damping" in stiff) == (True, False)
+    assert ('stiffness="4"' in stiff, "damping=" in stiff, "add its damping" in stiff) == (True, False, True)
     assert copied(system, values, **{"shoulder.mass": (1.0, 0.1, "kg", "identifiable")})["mjcf"] == []
 
 

@@ -31,7 +31,7 @@ COUNTER_WORDS = frozenset(_WORDS["counters"])  # names of columns that count row
 _NUMBERED_COMMAND = re.compile(r"q_(d|des|ref|cmd)_\d+")  # of a joint without a name
 _NO_POINT = re.compile(r"(.*_)?(force|torque|moment|velocity|acceleration|orientation|rotation|quaternion)", re.I)
 _BRACKETED_UNIT = re.compile(r"(.+?)[\s_]*[\[(]\s*([^\[\]()]+?)\s*[\])]")
-_SUFFIXED_UNIT = re.compile(rf"(.+)_({'|'.join(sorted(map(re.escape, UNIT_BY_WORD), key=len, reverse=True))})", re.I)
+_SUFFIXED_UNIT = re.compile(rf"(.+?)_({'|'.join(sorted(map(re.escape, UNIT_BY_WORD), key=len, reverse=True))})", re.I)
 
 
 def column_meanings(header: Sequence[str], sensor_components: Sequence[str]) -> tuple[list[ColumnMeaning], list[str]]:
@@ -100,7 +100,7 @@ def _spelled_meaning(column: str) -> ColumnMeaning:
 
 def _joint_force(column: str, known: Sequence[ColumnMeaning]) -> ColumnMeaning:
     """Effort of a joint, such as a rail, in a column named after its force, if its position is among `known`."""
-    found = re.fullmatch(r"(.*?)[\s_.]+force", column, re.IGNORECASE)
+    found = re.fullmatch(r"(.*?)[\s_.]+(?:force|f)(?:_n)?", column, re.IGNORECASE)
     return ("effort", found[1]) if found and ("position", found[1]) in known else None
 
 

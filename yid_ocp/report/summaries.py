@@ -34,6 +34,7 @@ from yid_ocp.report.terminal import (
     copyable_estimates_blocks,
     discretisation_shift_sentences,
     is_at_bound,
+    is_error,
     issue_descriptions,
     issue_summary_blocks,
     large_torque_offsets_sentence,
@@ -130,18 +131,20 @@ def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str
     notes, cures = result.get("refinement_notes", {}), discretisation_shift_sentences(result)[1]
     cures += (text for key, own in result.get("finer_settings", {}).items() if key in notes for text in own)
     finer = " ".join(["solve", *map(setting_option, dict.fromkeys(cures))])
-    steps = {"estimate again with the finer model": finer} if cures else {}
+    explains, is_trusted = result["fit"]["explains"], result["fit"]["data_trusted"]
+    steps = {"estimate again with the finer model": finer} if cures and (explains or notes) else {}
     if any(own["severity"] != "warning" and "yid-ocp diagnose" in own["advice"] for own in issues):
         steps["find what the model lacks, as advised above"] = "diagnose"
-    steps |= advised_step("estimate again", "solve", result) if issues else {}
-    if result["fit"]["data_trusted"] and not result["fit"]["explains"]:
+    steps |= advised_step("estimate again", "solve", result) if any(map(is_error, issues)) else {}
+    if is_trusted and not explains:
         steps["find the cause of the model's error"] = "diagnose"
-    elif result["fit"]["data_trusted"] and len(lost) < len(free):
+    elif is_trusted and len(lost) < len(free):
         efforts = " --set sensors.joints.effort.use=true" * bool(result.get("unused_efforts"))
         steps["test whether the model lacks an effect"] = f"diagnose{efforts}"
-    if lost and result["fit"]["explains"]:
+    if lost and explains:
         steps["rank experiments that determine the missing parameters (takes minutes)"] = "identifiability --what-if"
-    if any(own["interval"] is None for own in free.values() if own["verdict"] == "weak"):
+    weak = [own for own in free.values() if own["verdict"] == "weak" and not own.get("prior_std")]
+    if any(own["interval"] is None for own in weak):
         steps["compute the intervals exactly"] = "identifiability --intervals all"
     return steps
 
@@ -233,9 +236,13 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
         do = "`yid-ocp identifiability` shows why, and with --what-if it ranks experiments that do."
         yield f"{none}These recordings do not determine {abbreviated_names_text(causes)}. {do}"
     if weak:
-        rough = ", which are rough" * any(free[name]["interval"] is None for name in weak)
-        text = f"Only weakly determined (± above 10 %): {abbreviated_names_text(weak)}."
-        yield f"{text} Use their 95 % intervals{rough}."
+        corrections = [name for name in weak if free[name].get("prior_std") and free[name]["initial"] == 0]
+        others = [name for name in weak if name not in corrections]
+        rough = ", which are rough" * any(free[name]["interval"] is None for name in others)
+        text = f"Only weakly determined (± above 10 %): {abbreviated_names_text(others)}."
+        yield f"{text} Use their 95 % intervals{rough}." if others else ""
+        text = f"Corrections that are not known to within 10 %: {abbreviated_names_text(corrections)}."
+        yield f"{text} The ± of the found values includes this." if corrections else ""
 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]], explains: bool) -> Iterator[str]:

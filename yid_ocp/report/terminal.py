@@ -93,9 +93,14 @@ def value_text_and_display_unit(value: float | None, unit: str) -> tuple[str, st
 
 
 def issue_descriptions(result: Mapping[str, Any], *, severe: bool) -> str:
-    """Return the descriptions of the issues in a result that make its values unusable, or else of the others."""
-    shown = (entry for entry in result.get("issues") or () if (entry["severity"] != "warning") == severe)
-    return "; ".join(dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[entry["cause"]] for entry in shown))
+    """Return the descriptions of the issues in a result that make its values unusable, or else of other errors."""
+    shown = (own for own in result.get("issues") or () if (own["severity"] != "warning") == severe and is_error(own))
+    return "; ".join(dict.fromkeys(ISSUE_CAUSE_DESCRIPTIONS[own["cause"]] for own in shown))
+
+
+def is_error(issue: Mapping[str, Any]) -> bool:
+    """Check whether an issue in a result exceeds its limit; if not, the fit has corrected it."""
+    return bool(issue["evidence"] > 1)
 
 
 def advised_options(issues: Iterable[Mapping[str, Any]]) -> dict[str, str]:

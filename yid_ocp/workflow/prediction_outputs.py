@@ -92,7 +92,7 @@ def copyable_estimate_texts(
     terms, springs, joints = _found_joint_terms(system, theta, found, unknown), system.elastic_joints, []
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
     turning = [joint.name for joint in system.mechanism.joints if joint.kind == "revolute"]
-    lines = [_mjcf_joint_line(joint, own, turning) for joint, own in terms.items() if own and joint not in links]
+    lines = [_mjcf_joint_line(j, own, turning, unknown) for j, own in terms.items() if own and j not in links]
     for layout in system.segment_layouts:
         for key in ((layout.name, "bend"), (layout.name, "twist")):
             own = [terms[s.joint_name] for s in springs if (s.segment_name, s.deformation) == key]
@@ -148,10 +148,13 @@ def _found_joint_terms(
     return found
 
 
-def _mjcf_joint_line(joint: str, attributes: Mapping[str, float], turning: Sequence[str]) -> str:
+def _mjcf_joint_line(
+    joint: str, attributes: Mapping[str, float], turning: Sequence[str], unknown: Sequence[str] = ()
+) -> str:
     shown = " ".join(f'{key}="{size:.4g}"' for key, size in attributes.items())
     note = ' <!-- with compiler angle="radian" -->' if joint in turning and attributes.get("springref") else ""
-    return f'<joint name="{joint}" {shown}/>{note}'
+    lost = " <!-- add its damping, which is not known to within 10 % -->" * (f"{joint}.damping" in unknown)
+    return f'<joint name="{joint}" {shown}/>{note}{lost}'
 
 
 def _has_torque_bias(episode: Episode) -> bool:

@@ -129,12 +129,13 @@ def solution_to_result_dict(
     levels = {} if problem.has_process_noise else null_test.assumed_noise_rmse_by_channel(problem)
     share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
     noise = {channel: share * rmse for channel, rmse in levels.items()}
-    meanings = {own.name: own.description for own in problem.system.parameters}
+    priors = problem.options.prior_stds
+    more = {p.name: {"meaning": p.description, "prior_std": priors.get(p.name)} for p in problem.system.parameters}
     return {
         "format": "yid-solve/1",
         "status": solution.status.value,
         "message": solution.message,
-        "parameters": {n: asdict(e) | {"meaning": meanings[n.split("[")[0]]} for n, e in solution.parameters.items()},
+        "parameters": {n: asdict(e) | more[n.split("[")[0]] for n, e in solution.parameters.items()},
         **attributes_to_dict(solution, "cost iterations=n_iterations evaluations=n_evaluations seconds=wall_time"),
         "fit": asdict(solution.goodness_of_fit),
         "residuals": {channel: own | {"expected": noise.get(channel)} for channel, own in residuals.items()},
