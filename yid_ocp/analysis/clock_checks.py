@@ -286,7 +286,7 @@ def _late(samples: SensorMeasurements, speed: Array, bend: Array, path: Array, r
         left, name = (samples.weight * (path - samples.value))[samples.positive_weight_mask], samples.sensor.group_name
         late = float(speed @ left / (speed @ speed))
         error = 0.5 * late**2 * float(np.sqrt(np.mean(bend**2)))
-        what = f"the fit finds time stamps of {name} {1e3 * abs(late):.2g} ms {'late' if late > 0 else 'early'}. Its "
+        what = f"the fit finds time stamps of {name} roughly {_lateness_text(late)}. Its "
         what += f"linear correction leaves {error:.2g} times the noise ({_MAX_CLOCK_RESIDUE:g} is tolerated)"
         advice = "if you know the offset, import again with --clock-offset FILE=SECONDS, else let a fit find it"
         if (ratio := error / _MAX_CLOCK_RESIDUE) > 1:

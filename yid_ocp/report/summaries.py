@@ -29,6 +29,7 @@ from yid_ocp.report.terminal import (
     SummaryStatement,
     SummaryTable,
     TableRows,
+    absent_parameters_sentence,
     advised_step,
     bound_range_text,
     copyable_estimates_blocks,
@@ -71,7 +72,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
             if "noise_overstated" in causes:
                 said = "The stated noise is too large to test whether the model explains the recordings."
             still = " ".join(causes.get("weak_excitation", ()))
-            texts += [*_found_and_lost(free, is_safe, mild, still), said]
+            texts += [*_found_and_lost(free, is_safe, mild, still), absent_parameters_sentence(free), said]
         yield from (SummaryStatement(text, "conclusion") for text in texts)
     else:
         said = "the fit failed" if failed else "the fit did not converge"
@@ -246,17 +247,18 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]], is_safe: bool, mild: 
 
 
 def _bound_sentences(free: Mapping[str, Mapping[str, Any]], explains: bool) -> Iterator[str]:
-    """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one."""
+    """Yield a sentence for each bound at which estimates ended. Estimates at bounds of the same size share one.
+
+    Without the estimates of `absent_parameters_sentence` if the model explains the recordings.
+    """
     by_bound = dict[tuple[str, str], list[str]]()
     for name, entry in free.items():
         for side in ("lower", "upper"):
-            if is_at_bound(entry, (side,)):
+            if is_at_bound(entry, (side,)) and (entry[side] != 0 or not explains):
                 bound = f"{side} bound of {entry[side]:.4g} {entry['unit']}".removesuffix(" 1")
                 remedy = "Widen parameters.{0}.bounds, or fix {0} there if the bound is a physical limit."
-                if entry[side] == 0 and not explains:
+                if entry[side] == 0:
                     remedy = "The model's error can be the cause."
-                elif entry[side] == 0:
-                    remedy = "Fix {0} there (parameters.{0}.free: false) if it is absent, else run `yid-ocp diagnose`."
                 elif entry["verdict"] == "not_identifiable" and explains:
                     remedy = "Fix {0} at a known value, because these recordings do not determine it."
                 by_bound.setdefault((bound, remedy), []).append(name)

@@ -214,7 +214,7 @@ def _summary_lines(
     ]
     if damping := proposal.urdf_joint_damping:
         reason = f"of {abbreviated_names_text([*damping], math.inf)}, as the robot file states"
-        rows.append(("model.damping", f"{_number_or_numbers_by_name(damping)} N m s/rad", reason))
+        rows.append(("model.damping", f"{_number_or_numbers_by_name(damping, 4)} N m s/rad", reason))
     lines = aligned_table_lines(rows)
     told = [f"sensors.{group}: {s}" for group, own in proposal.point_placements.items() for s in _place_sentences(own)]
     lost = [f"warning: {text}" for text in told if "`init` leaves out" in text or "too far" in text]
@@ -321,11 +321,11 @@ def _number(value: float) -> str:
     return text if "e" not in text or "." in text.partition("e")[0] else text.replace("e", ".0e")
 
 
-def _number_or_numbers_by_name(value: float | Mapping[str, float]) -> str:
-    """Return one number if all are equal, else a mapping."""
+def _number_or_numbers_by_name(value: float | Mapping[str, float], digits: int = 2) -> str:
+    """Return one number if all are equal to so many digits, else a mapping."""
     if not isinstance(value, Mapping):
         return _number(value)
-    rounded = {name: float(f"{number:.2g}") for name, number in value.items()}
+    rounded = {name: float(f"{number:.{digits}g}") for name, number in value.items()}
     return _value(rounded) if len(set(rounded.values())) > 1 else _number(next(iter(rounded.values())))
 
 
