@@ -50,7 +50,6 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
 
 
 @functools.cache
@@ -147,7 +146,8 @@ def compile_and_load_library(
     try:
         return ctypes.CDLL(str(target))
     except OSError as error:
-        _LOG.warning(_NOT_LOADED, error)
+        message = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
+        _LOG.warning(message, error)
         return None
 
 
@@ -157,14 +157,8 @@ def compile_casadi_function(function: ca.Function, level: str = _NO_OPTIMIZATION
     The default `level` suits large functions whose calls take seconds in all. The compiled function cannot be
     differentiated.
     """
-    target = _library_file(casadi_c_source(function.name(), (function,)), level)
-    if target is None:
-        return function
-    try:
-        return ca.external(function.name(), str(target))
-    except RuntimeError as error:
-        _LOG.warning(_NOT_LOADED, error)
-        return function
+    library = compile_and_load_library(casadi_c_source(function.name(), (function,)), level=level)
+    return function if library is None else ca.external(function.name(), library._name)
 
 
 def _library_file(source: str, level: str, make: Callable[[], str | None] | None = None) -> Path | None:
