@@ -210,18 +210,15 @@ def _nonzero_values(matrix: ca.MX) -> ca.MX:
 
 def _sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
     """Assemble a sparse matrix from entries at distinct positions."""
-    order = np.lexsort((row, column))
-    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
-    return ca.MX(ca.Sparsity(*shape, start.tolist(), row[order].tolist()), entries[order.tolist()])
+    sparsity, order = ca.Sparsity.triplet(*shape, row.tolist(), column.tolist(), False)
+    return ca.MX(sparsity, entries[order])
 
 
 def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
     """Assemble a sparse square matrix from entries, summing those at the same position."""
-    keys, place = np.unique(column * size + row, return_inverse=True)
-    start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
-    sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
+    sparsity, place = ca.Sparsity.triplet(size, size, row.tolist(), column.tolist(), True)
     # one column for every entry, with a one in the row of the entry's position
-    columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
+    columns = ca.Sparsity(sparsity.nnz(), len(place), list(range(len(place) + 1)), place)
     return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
 
 
