@@ -108,15 +108,13 @@ class MappedFunctionTerm:
         """The local function's outputs (ny K, 1) at all K places, one place after another."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
-    def _jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Nonzero entries of the Jacobian with respect to w, in the order of `_jacobian_nonzero_indices`."""
-        return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
-
-    def _jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
-        """Row and column indices of the nonzero entries of the Jacobian of all values with respect to w."""
+    def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Return the sparse Jacobian (ny K, nw) of all outputs with respect to the program's variables w."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
-        first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
-        return (first + row).ravel(), self.variable_indices[:, column].ravel()
+        rows = (len(self.row_names) * np.arange(len(self.variable_indices))[:, None] + row).ravel()
+        columns, shape = self.variable_indices[:, column].ravel(), (self.n_values, w.numel())
+        sparsity, order = ca.Sparsity.triplet(*shape, rows.tolist(), columns.tolist(), False)
+        return ca.MX(sparsity, _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))[order])
 
     def _weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
         """Entries, rows and columns (with repetitions) of the Hessian of weight . values in w; None if it is zero."""
@@ -162,9 +160,7 @@ class ResidualTerm:
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's variables w."""
-        entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
-        placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
-        return ca.mtimes(self._residual_jacobian_by_term_values(p), placed)
+        return ca.mtimes(self._residual_jacobian_by_term_values(p), self.term.jacobian(w, p))
 
     def _evaluate_loss(self, r: ca.MX) -> ca.MX:
         if math.isinf(self.huber_threshold):
@@ -206,12 +202,6 @@ class GaussNewtonHessianRidge:
 
 def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
-
-
-def _sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
-    """Assemble a sparse matrix from entries at distinct positions."""
-    sparsity, order = ca.Sparsity.triplet(*shape, row.tolist(), column.tolist(), False)
-    return ca.MX(sparsity, entries[order])
 
 
 def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
@@ -391,16 +381,9 @@ class NonlinearProgram(ReprMixin):
     @CasadiLockedProperty
     def jac_g(self) -> ca.MX:
         """Return the sparse Jacobian of the constraints g with respect to the variables w."""
-        entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
-        for term in self.constraint_terms:
-            row, column = term._jacobian_nonzero_indices()
-            entries.append(term._jacobian_nonzero_values(self.w, self.p))
-            rows.append(at + row)
-            columns.append(column)
-            at += term.n_values
-        where = np.concatenate(rows), np.concatenate(columns)
-        placed = _sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
-        return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
+        own = (term.jacobian(self.w, self.p) for term in self.constraint_terms)
+        added = (ca.jacobian(extra.constraints, self.w) for extra in self.user_terms)
+        return ca.vertcat(ca.MX(0, self.w.numel()), *own, *added)
 
     @CasadiLockedProperty
     def grad_f(self) -> ca.MX:
