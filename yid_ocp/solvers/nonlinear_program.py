@@ -116,15 +116,19 @@ class MappedFunctionTerm:
         sparsity, order = ca.Sparsity.triplet(*shape, rows.tolist(), columns.tolist(), False)
         return ca.MX(sparsity, _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))[order])
 
-    def _weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
-        """Entries, rows and columns (with repetitions) of the Hessian of weight . values in w; None if it is zero."""
-        function = self.local_function._weighted_hessian_function
+    def _weighted_hessian(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> ca.MX:
+        """Sparse Hessian (nw, nw) of weight . values in w. Entries of several places at one position are summed."""
+        size, function = w.numel(), self.local_function._weighted_hessian_function
         if function is None:
-            return None
+            return ca.MX(size, size)
         weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))
         entries = _nonzero_values(self._map_over_places(function, w, p, weights))
         row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
-        return entries, self.variable_indices[:, row].ravel(), self.variable_indices[:, column].ravel()
+        rows, columns = (self.variable_indices[:, at].ravel().tolist() for at in (row, column))
+        sparsity, place = ca.Sparsity.triplet(size, size, rows, columns, True)
+        # one column for every entry, with a one in the row of the entry's position
+        position = ca.Sparsity(sparsity.nnz(), len(place), list(range(len(place) + 1)), place)
+        return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(position, 1.0)), entries))
 
 
 @dataclass(frozen=True)
@@ -202,14 +206,6 @@ class GaussNewtonHessianRidge:
 
 def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
-
-
-def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
-    """Assemble a sparse square matrix from entries, summing those at the same position."""
-    sparsity, place = ca.Sparsity.triplet(size, size, row.tolist(), column.tolist(), True)
-    # one column for every entry, with a one in the row of the entry's position
-    columns = ca.Sparsity(sparsity.nnz(), len(place), list(range(len(place) + 1)), place)
-    return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
 
 
 @dataclass(frozen=True)
@@ -424,7 +420,7 @@ class NonlinearProgram(ReprMixin):
             if exact:
                 matrix = residual._residual_jacobian_by_term_values(self.p)
                 pull = ca.mtimes(matrix.T, residual._loss_gradient_by_residual(r))
-                total += self._curvature(residual.term, self.lam_f * pull)
+                total += residual.term._weighted_hessian(self.w, self.p, self.lam_f * pull)
         return total
 
     def _other_curvature(self, exact: bool) -> ca.MX:
@@ -432,17 +428,14 @@ class NonlinearProgram(ReprMixin):
         if not exact and self.ridge is not None:
             total += self.lam_f * self._ridge(self.ridge)
         for term in self.constraint_terms:
-            total += self._curvature(term, self.lam_g[at : at + term.n_values]) if exact else 0
+            weight = self.lam_g[at : at + term.n_values]
+            total += term._weighted_hessian(self.w, self.p, weight) if exact else 0
             at += term.n_values
         for extra in self.user_terms:
             weight = self.lam_g[at : at + len(extra.lower)]
             at += len(extra.lower)
             total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
         return total
-
-    def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
-        curved = term._weighted_hessian_triplets(self.w, self.p, weight)
-        return 0 if curved is None else _sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
     def _ridge(self, ridge: GaussNewtonHessianRidge) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)
