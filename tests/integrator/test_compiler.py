@@ -282,22 +282,3 @@ def test_values_at_every_point(use_compiler, monkeypatch):
     assert none.shape == (4, 0, 2)
     with pytest.raises(AssertionError, match=r"input 1 of products"):
         MappedFunction(function, use_compiler=use_compiler)(points, shared[None])
-
-
-@needs_compiler
-def test_no_memory_for_a_mapped_function(poor, monkeypatch):
-    libraries, original = [], compiler.compile_and_load_library
-
-    def poor_library(source):
-        libraries.append(original(poor.source + source))
-        return libraries[-1]
-
-    monkeypatch.setattr(compiler, "compile_and_load_library", poor_library)
-    monkeypatch.setattr(compiler, "_MIN_COMPILED_INSTRUCTION_COUNT", 0)
-    x = ca.SX.sym("x", 2)
-    double = MappedFunction(ca.Function("double_it", [x], [2 * x]))
-    poor.watch(libraries[0])
-    points = np.arange(6.0).reshape(3, 2)
-    assert poor.grants_needed(lambda: double(points)) == 2
-    poor.grants.value = 2
-    np.testing.assert_array_equal(double(points)[0][:, :, 0], 2 * points)

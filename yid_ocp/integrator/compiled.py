@@ -104,7 +104,6 @@ class _ThetaColumns:
     address: int
     patterns: tuple[IntArray, ...]
     work: int
-    library: ctypes.CDLL
 
 
 class CompiledKernel:
@@ -309,4 +308,4 @@ def _theta_columns(model: StepEquationsAndFunctions, kernel: ctypes.CDLL, names:
     assert address is not None
     patterns = (function.sparsity_out(i) for i in range(function.n_out()))
     compressed = (np.array([s.size1(), s.size2(), *s.colind(), *s.row()], np.int64) for s in patterns)
-    return _ThetaColumns(address, tuple(compressed), max(function.sz_w(), function.sz_iw(), 1), library)
+    return _ThetaColumns(address, tuple(compressed), max(function.sz_w(), function.sz_iw(), 1))

@@ -29,7 +29,6 @@ from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.codegen import casadi_c_source, rows_and_columns_of_nonzeros
 from yid_ocp.integrator.interpreted import function_bound_to_arrays
-from yid_ocp.integrator.step_model import NewtonStatusCode, out_of_memory_error
 from yid_ocp.parallel import CasadiLockedCache
 
 _LOG = logging.getLogger(__name__)
@@ -51,7 +50,6 @@ _NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spo
 _BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
 _HUNG_COMPILERS: set[str] = set()  # compilers that did not end in time: they are waited for once
 _MARKER_SYMBOL = "yid_compiled"
-_NOT_LOADED = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
 
 
 @functools.cache
@@ -148,23 +146,19 @@ def compile_and_load_library(
     try:
         return ctypes.CDLL(str(target))
     except OSError as error:
-        _LOG.warning(_NOT_LOADED, error)
+        message = "Compiled code cannot be loaded (%s), so computations run uncompiled (same results, but slower)."
+        _LOG.warning(message, error)
         return None
 
 
-def compile_casadi_function(function: ca.Function) -> ca.Function:
-    """Compile a CasADi function to C, without optimisation. Returns the function unchanged if no compiler works.
+def compile_casadi_function(function: ca.Function, level: str = _NO_OPTIMIZATION_FLAG) -> ca.Function:
+    """Compile a CasADi function to C. Returns the function unchanged if no compiler works.
 
-    This suits large functions whose calls take seconds in all. The compiled function cannot be differentiated.
+    The default `level` suits large functions whose calls take seconds in all. The compiled function cannot be
+    differentiated.
     """
-    target = _library_file(casadi_c_source(function.name(), (function,)), _NO_OPTIMIZATION_FLAG)
-    if target is None:
-        return function
-    try:
-        return ca.external(function.name(), str(target))
-    except RuntimeError as error:
-        _LOG.warning(_NOT_LOADED, error)
-        return function
+    library = compile_and_load_library(casadi_c_source(function.name(), (function,)), level=level)
+    return function if library is None else ca.external(function.name(), library._name)
 
 
 def _library_file(source: str, level: str, make: Callable[[], str | None] | None = None) -> Path | None:
@@ -259,37 +253,9 @@ class MappedFunction:
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
         is_long = not function.is_a("SXFunction") or function.n_instructions() >= _MIN_COMPILED_INSTRUCTION_COUNT
-        self._library = compile_and_load_library(self._source()) if use_compiler and is_long else None
+        quick = compile_casadi_function(function, _optimization_flag()) if use_compiler and is_long else function
         shared = sorted(shared_inputs)
-        self._mapped = CasadiLockedCache[int, ca.Function](lambda n: function.map("mapped", "serial", n, shared, []))
-
-    def _source(self) -> str:
-        name, f = self.function.name(), self.function
-        strides = ", ".join("0" if i in self.shared_inputs else str(size) for i, size in enumerate(self._inputs)) or "0"
-        widths = ", ".join(str(size) for size in self._outputs) or "0"
-        return f"""{casadi_c_source(name, (f,))}
-#include <stdlib.h>
-#ifndef YID_ALLOCATE
-#define YID_ALLOCATE calloc
-#define YID_FREE free
-#endif
-int yid_map(int count, const double **in, double **out) {{
-    static const int stride[] = {{{strides}}}, width[] = {{{widths}}};
-    const double *arg[{max(f.sz_arg(), 1)}];
-    double *res[{max(f.sz_res(), 1)}];
-    double *w = YID_ALLOCATE({max(f.sz_w(), 1)}, sizeof(double));
-    long long *iw = YID_ALLOCATE({max(f.sz_iw(), 1)}, sizeof(long long));
-    int status = w && iw ? {NewtonStatusCode.OK.value} : {NewtonStatusCode.OUT_OF_MEMORY.value};
-    for (int k = 0; k < count && !status; k++) {{
-        for (int i = 0; i < {len(self._inputs)}; i++) arg[i] = in[i] + (size_t)k * stride[i];
-        for (int o = 0; o < {len(self._outputs)}; o++) res[o] = out[o] + (size_t)k * width[o];
-        if ({name}(arg, res, iw, w, 0)) status = {NewtonStatusCode.NOT_FINITE.value};
-    }}
-    YID_FREE(w);
-    YID_FREE(iw);
-    return status;
-}}
-"""
+        self._mapped = CasadiLockedCache[int, ca.Function](lambda n: quick.map("mapped", "serial", n, shared, []))
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """Values at all points, dense (count, rows, columns) per output; inputs (count, size), or (size,) if shared."""
@@ -299,15 +265,7 @@ int yid_map(int count, const double **in, double **out) {{
             expected = (self._inputs[i],) if i in self.shared_inputs else (count, self._inputs[i])
             assert array.shape == expected, f"input {i} of {self.function.name()}: {array.shape}, not {expected}"
         values = [np.zeros((count, size)) for size in self._outputs]
-        if self._library is not None:
-            pointers = (ctypes.c_void_p * max(len(arrays), 1))(*(a.ctypes.data for a in arrays))
-            targets = (ctypes.c_void_p * len(values))(*(v.ctypes.data for v in values))
-            code = self._library.yid_map(ctypes.c_int(count), pointers, targets)
-            if code == NewtonStatusCode.OUT_OF_MEMORY:
-                raise out_of_memory_error(self.function.name(), 8 * (self.function.sz_w() + self.function.sz_iw()))
-            if code != NewtonStatusCode.OK:
-                raise RuntimeError(f"CasADi could not evaluate {self.function}")
-        elif count:
+        if count:
             function_bound_to_arrays(self._mapped(count), arrays, values)()
         dense = []
         for o, value in enumerate(values):

@@ -1081,10 +1081,8 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
         memcpy(out->rows_old + (size_t)step * NT * NQZ, k->R0, sizeof(double) * NT * NQZ);
         memcpy(out->p1_new + (size_t)step * N * NT, k->P1, sizeof(double) * N * NT);
         memcpy(out->p1_old + (size_t)step * N * NQZ, k->P0, sizeof(double) * N * NQZ);
-        if (NU) {
-            memcpy(out->rows_input + (size_t)step * NT * NU, k->Ru, sizeof(double) * NT * NU);
-            memcpy(out->p1_input + (size_t)step * N * NU, k->Pu, sizeof(double) * N * NU);
-        }
+        memcpy(out->rows_input + (size_t)step * NT * NU, k->Ru, sizeof(double) * NT * NU);
+        memcpy(out->p1_input + (size_t)step * N * NU, k->Pu, sizeof(double) * N * NU);
         if (dir && dir->theta_count) {
             const int d = dir->count;
             theta_columns(motion, &a, 0);

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import scipy.special
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
@@ -263,10 +264,8 @@ def huber_loss_and_sqrt_weights(residual: Array, scale: float) -> tuple[float, A
     Beyond `scale` [standard deviations] the loss is linear. An infinite `scale` gives plain least squares.
     """
     size = np.abs(residual)
-    inside = size <= scale
-    with np.errstate(invalid="ignore"):
-        cost = np.where(inside, 0.5 * residual**2, scale * (size - 0.5 * scale) if np.isfinite(scale) else 0.0)
-    return float(np.sum(cost)), np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
+    factor = np.where(size <= scale, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
+    return float(np.sum(scipy.special.huber(scale, residual))), factor
 
 
 def whiten_with_extra_errors(columns: Array, spread: Array) -> Array:

@@ -108,25 +108,27 @@ class MappedFunctionTerm:
         """The local function's outputs (ny K, 1) at all K places, one place after another."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
-    def _jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Nonzero entries of the Jacobian with respect to w, in the order of `_jacobian_nonzero_indices`."""
-        return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
-
-    def _jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
-        """Row and column indices of the nonzero entries of the Jacobian of all values with respect to w."""
+    def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Return the sparse Jacobian (ny K, nw) of all outputs with respect to the program's variables w."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
-        first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
-        return (first + row).ravel(), self.variable_indices[:, column].ravel()
+        rows = (len(self.row_names) * np.arange(len(self.variable_indices))[:, None] + row).ravel()
+        columns, shape = self.variable_indices[:, column].ravel(), (self.n_values, w.numel())
+        sparsity, order = ca.Sparsity.triplet(*shape, rows.tolist(), columns.tolist(), False)
+        return ca.MX(sparsity, _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))[order])
 
-    def _weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
-        """Entries, rows and columns (with repetitions) of the Hessian of weight . values in w; None if it is zero."""
-        function = self.local_function._weighted_hessian_function
+    def _weighted_hessian(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> ca.MX:
+        """Sparse Hessian (nw, nw) of weight . values in w. Entries of several places at one position are summed."""
+        size, function = w.numel(), self.local_function._weighted_hessian_function
         if function is None:
-            return None
+            return ca.MX(size, size)
         weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))
         entries = _nonzero_values(self._map_over_places(function, w, p, weights))
         row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
-        return entries, self.variable_indices[:, row].ravel(), self.variable_indices[:, column].ravel()
+        rows, columns = (self.variable_indices[:, at].ravel().tolist() for at in (row, column))
+        sparsity, place = ca.Sparsity.triplet(size, size, rows, columns, True)
+        # one column for every entry, with a one in the row of the entry's position
+        position = ca.Sparsity(sparsity.nnz(), len(place), list(range(len(place) + 1)), place)
+        return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(position, 1.0)), entries))
 
 
 @dataclass(frozen=True)
@@ -162,9 +164,7 @@ class ResidualTerm:
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Return the sparse Jacobian (nr, nw) of the residuals with respect to the program's variables w."""
-        entries, shape = self.term._jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
-        placed = _sparse_mx_from_entries(entries, *self.term._jacobian_nonzero_indices(), shape)
-        return ca.mtimes(self._residual_jacobian_by_term_values(p), placed)
+        return ca.mtimes(self._residual_jacobian_by_term_values(p), self.term.jacobian(w, p))
 
     def _evaluate_loss(self, r: ca.MX) -> ca.MX:
         if math.isinf(self.huber_threshold):
@@ -206,23 +206,6 @@ class GaussNewtonHessianRidge:
 
 def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
-
-
-def _sparse_mx_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
-    """Assemble a sparse matrix from entries at distinct positions."""
-    order = np.lexsort((row, column))
-    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
-    return ca.MX(ca.Sparsity(*shape, start.tolist(), row[order].tolist()), entries[order.tolist()])
-
-
-def _sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
-    """Assemble a sparse square matrix from entries, summing those at the same position."""
-    keys, place = np.unique(column * size + row, return_inverse=True)
-    start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
-    sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
-    # one column for every entry, with a one in the row of the entry's position
-    columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
-    return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
 
 
 @dataclass(frozen=True)
@@ -394,16 +377,9 @@ class NonlinearProgram(ReprMixin):
     @CasadiLockedProperty
     def jac_g(self) -> ca.MX:
         """Return the sparse Jacobian of the constraints g with respect to the variables w."""
-        entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
-        for term in self.constraint_terms:
-            row, column = term._jacobian_nonzero_indices()
-            entries.append(term._jacobian_nonzero_values(self.w, self.p))
-            rows.append(at + row)
-            columns.append(column)
-            at += term.n_values
-        where = np.concatenate(rows), np.concatenate(columns)
-        placed = _sparse_mx_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
-        return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
+        own = (term.jacobian(self.w, self.p) for term in self.constraint_terms)
+        added = (ca.jacobian(extra.constraints, self.w) for extra in self.user_terms)
+        return ca.vertcat(ca.MX(0, self.w.numel()), *own, *added)
 
     @CasadiLockedProperty
     def grad_f(self) -> ca.MX:
@@ -444,7 +420,7 @@ class NonlinearProgram(ReprMixin):
             if exact:
                 matrix = residual._residual_jacobian_by_term_values(self.p)
                 pull = ca.mtimes(matrix.T, residual._loss_gradient_by_residual(r))
-                total += self._curvature(residual.term, self.lam_f * pull)
+                total += residual.term._weighted_hessian(self.w, self.p, self.lam_f * pull)
         return total
 
     def _other_curvature(self, exact: bool) -> ca.MX:
@@ -452,17 +428,14 @@ class NonlinearProgram(ReprMixin):
         if not exact and self.ridge is not None:
             total += self.lam_f * self._ridge(self.ridge)
         for term in self.constraint_terms:
-            total += self._curvature(term, self.lam_g[at : at + term.n_values]) if exact else 0
+            weight = self.lam_g[at : at + term.n_values]
+            total += term._weighted_hessian(self.w, self.p, weight) if exact else 0
             at += term.n_values
         for extra in self.user_terms:
             weight = self.lam_g[at : at + len(extra.lower)]
             at += len(extra.lower)
             total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
         return total
-
-    def _curvature(self, term: MappedFunctionTerm, weight: ca.MX) -> ca.MX | int:
-        curved = term._weighted_hessian_triplets(self.w, self.p, weight)
-        return 0 if curved is None else _sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
     def _ridge(self, ridge: GaussNewtonHessianRidge) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)
