@@ -227,11 +227,7 @@ def _examined_anew(seen: _Examined, judged: Judgement) -> _Examined:
 
 
 class _FinerModelExplainsError(Exception):
-    """A search is obsolete, because a finer discretisation removes what more effects would explain."""
-
-    def __init__(self, examined: _Examined) -> None:
-        super().__init__()
-        self.examined = examined
+    """A finer discretisation removes what more effects would explain. The argument is the model examined with it."""
 
 
 def _check_discretisation(seen: _Examined, fit: RefitStatistics, gap: float) -> None:
@@ -365,7 +361,7 @@ def _diagnosed(problem: EstimationProblem, seen: _Examined, earlier: EarlierRuns
         try:
             judged = judge(checked, evidence)
         except _FinerModelExplainsError as found:
-            seen = found.examined
+            seen = found.args[0]
             continue
         # a search that begins anew would find nothing
         if search.is_skipped_past_deadline(*(f"a change of {name} since the baseline" for name in shifted)):

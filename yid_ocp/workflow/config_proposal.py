@@ -247,14 +247,11 @@ def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> t
 def _torque_bias_std(tree: Mechanism, recorded: JointGroup, joints: Sequence[str]) -> dict[str, float]:
     if recorded.effort is None or recorded.effort_bias_std is not None:
         return {}
-    limits = {name: tree.joint(name).effort_limit for name in joints}
     largest = dict(zip(recorded.names, np.nanmax(np.abs(recorded.effort), axis=0).tolist(), strict=True))
-    by_limit = {
-        name: min(_TORQUE_BIAS_FRACTION * limit, _MAX_TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name])
-        for name, limit in limits.items()
-        if 0 < limit < math.inf
-    }
-    return {name: _TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name] for name in joints} | by_limit
+    by_limit = {name: _TORQUE_BIAS_FRACTION * tree.joint(name).effort_limit for name in joints}
+    most = {name: _MAX_TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name] for name in joints}
+    known = {name: min(size, most[name]) for name, size in by_limit.items() if 0 < size < math.inf}
+    return {name: _TORQUE_BIAS_FRACTION_OF_LARGEST * largest[name] for name in joints} | known
 
 
 def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
