@@ -307,9 +307,8 @@ class _Parser(argparse.ArgumentParser):
                     what, hint = f"--set {name} has no value", f"write --set {name}=VALUE, without spaces"
                 raise ConfigError(what, where=self.prog, allowed=self._usage(), hint=hint)
             said = unknown_name_error_arguments(flag, flags, self._help())
-            others = [
-                name for name, own in (self.parsers_by_command or {}).items() if flag in own._option_string_actions
-            ]
+            parsers = self.parsers_by_command or {}
+            others = [name for name, own in parsers.items() if flag in own._option_string_actions]
             what = f"there is no option '{flag}'" + (f"; the command {' or '.join(others)} has it" if others else "")
             raise ConfigError(what, where=self.prog, **said)
         return found, rest

@@ -26,7 +26,7 @@ def swinging(urdf_folder):
 def test_the_held_out_blocks_begin_where_the_others_do(swinging):
     finding = diagnose(swinging, ["joint_coulomb", "joint_viscous"])
     assert finding.is_split_in_blocks
-    assert "every second block of time is held out" in finding.summary
+    assert "Every second block of time is held out" in finding.summary
     assert finding.nominal_held_out_test.chi2_per_dof == pytest.approx(finding.nominal_test.chi2_per_dof, rel=0.3)
     assert finding.verdict == "effect"
     assert finding.accepted_effects[0].label == "joint_coulomb@elbow"

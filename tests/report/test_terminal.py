@@ -98,7 +98,7 @@ def test_a_solve_says_what_is_not_found():
         assert f"{name} ended at the {side} bound of {bound} N m/rad{rest}" in said
         assert f"Widen parameters.{name}.bounds, or" in said
     gone = " ".join(told("yid-solve/1", solved(parameters={"p": parameter("at_bound", 0.0) | {"lower": 0.0}})))
-    assert "nothing of what ended at 0, the smallest possible value: p. Fix it there" in " ".join(gone.split())
+    assert "nothing of what ended at 0, its smallest value: p. Fix it there" in " ".join(gone.split())
     assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
     issue = dict.fromkeys(("where", "certainty", "what", "advice", "severity"), "warning") | {"evidence": 2.0}
     issue |= {"cause": "weak_excitation", "setting": "parameters.a.free: false"}

@@ -257,12 +257,12 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
     for (i, name), (shift, std) in late.items():
         [group] = (own for own in recordings[i].points if own.name == name)
         if abs(shift) > 0.5 * median_sample_period(group.t):
-            words = (
-                f"a fit finds time stamps of {name} {_lateness_text(shift)} and corrects them. Their clock_offset_std "
-            )
-            words += f"is {1e3 * std:.3g} ms"
             ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
-            words += f" ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)" if ratio > 1 else ""
+            words = f"a fit finds time stamps of {name} {_lateness_text(shift)} and corrects them. Their stated "
+            words += (
+                f"clock_offset_std is {1e3 * std:.3g} ms"
+                + f" ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)" * (ratio > 1)
+            )
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, recordings[i].name, name, "t"))
     return problem, issues
 

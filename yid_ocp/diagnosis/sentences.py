@@ -245,9 +245,8 @@ def _notes(result: DiagnosisResult) -> list[tuple[str, str]]:
     stated, used = (f"{step:.4g}" for step in result.stated_and_used_time_step)
     finer = f"Time steps of {stated} s are too long for these motions, so the diagnosis used {used} s."
     blocks = (
-        "The values use half of the data, as recordings.held_out is empty: every second block of time is held out. "
+        "Every second block of time is held out, as recordings.held_out is empty. `solve` fits all: use its values."
     )
-    blocks += "`solve` fits all data."
     links = "The model has too few links. The resulting error is not part of these numbers."
     fitted, problem = result.nominal_model.values, result.nominal_model.problem
     divided = problem.options.divided_links_model

@@ -296,9 +296,7 @@ def absent_parameters_sentence(free: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a sentence on estimates that ended at 0, the smallest possible value. Empty if there are none."""
     names = abbreviated_names_text([n for n, e in free.items() if is_at_bound(e, ("lower",)) and e["lower"] == 0])
     do = "Fix it there (parameters.NAME.free: false) if it is absent, else run `yid-ocp diagnose`."
-    return (
-        f"The recordings show nothing of what ended at 0, the smallest possible value: {names}. {do}" if names else ""
-    )
+    return f"The recordings show nothing of what ended at 0, its smallest value: {names}. {do}" if names else ""
 
 
 def recording_summary_lines(recording: Recording) -> list[str]:

@@ -446,12 +446,12 @@ def _units_and_scales(
     """The first unit that a column of each quantity states, and the factor from every column's own unit to that one."""
     units, scales = dict[str, str](), list[float]()
     for meaning, unit in columns:
-        stated, scale = _quantity_and_unit(meaning, unit), 1.0
+        stated = _quantity_and_unit(meaning, unit)
+        scales.append(1.0)
         if stated and stated[0] not in (options.units or {}):
             first = units.setdefault(*stated)
             own, of_first = (base.factor_to_si_by_quantity({stated[0]: u}, where)[stated[0]] for u in (unit, first))
-            scale = own / of_first
-        scales.append(scale)
+            scales[-1] = own / of_first
     return units, scales
 
 
