@@ -258,11 +258,9 @@ def problem_with_fitted_clocks_and_issues(problem: EstimationProblem) -> tuple[E
         [group] = (own for own in recordings[i].points if own.name == name)
         if abs(shift) > 0.5 * median_sample_period(group.t):
             ratio = abs(shift) / (_MAX_CLOCK_SHIFT_Z * std)
-            words = f"a fit finds time stamps of {name} {_lateness_text(shift)} and corrects them. Their stated "
-            words += (
-                f"clock_offset_std is {1e3 * std:.3g} ms"
-                + f" ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)" * (ratio > 1)
-            )
+            limit = f" ({_MAX_CLOCK_SHIFT_Z:g} times this is tolerated)" * (ratio > 1)
+            words = f"a fit finds time stamps of {name} {_lateness_text(shift)} and corrects them. Their "
+            words += f"clock_offset_std is {1e3 * std:.3g} ms{limit}"
             issues.append(Issue("clock_offset", words, "warning", ratio, advice, recordings[i].name, name, "t"))
     return problem, issues
 
