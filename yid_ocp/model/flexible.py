@@ -118,10 +118,10 @@ class FlexibleObject(ReprMixin):
         angles = [Parameter(p, 0.0, "rad", -limit, limit, text.format(p[-1])) for p in ROOT_ROTATION_PARAMETERS]
         rotation = symbolic_rotation_from_rpy(*(angle.symbol for angle in angles))
         frame = Frame(-1, Placement(rotation, ca.SX(3, 1)))
-        mount = Mechanism("mount", (), {"mount": frame}, Parameters(angles))
-        tree = mount.with_attached_mechanism(self.mechanism, "mount")
+        tree = Mechanism("mount", (), {"mount": frame}).with_attached_mechanism(self.mechanism, "mount")
         frames = {name: frame for name, frame in tree.frames.items() if name != "mount"}
-        return replace(self, mechanism=replace(tree, frames=frames))
+        parameters = tree.parameters.with_added(angles)
+        return replace(self, mechanism=replace(tree, frames=frames, parameters=parameters))
 
     def _summary(self) -> ReprTexts:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
