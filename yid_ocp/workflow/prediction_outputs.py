@@ -153,7 +153,8 @@ def _mjcf_joint_line(
 ) -> str:
     shown = " ".join(f'{key}="{size:.4g}"' for key, size in attributes.items())
     note = ' <!-- with compiler angle="radian" -->' if joint in turning and attributes.get("springref") else ""
-    lost = " <!-- add its damping, which is not known to within 10 % -->" * (f"{joint}.damping" in unknown)
+    part = "damping contains" if "damping" in attributes else "add"
+    lost = f" <!-- {part} {joint}.damping, not known to within 10 % -->" * (f"{joint}.damping" in unknown)
     return f'<joint name="{joint}" {shown}/>{note}{lost}'
 
 
