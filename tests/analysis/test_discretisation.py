@@ -35,6 +35,7 @@ from yid_ocp.model import FlexibleSegment, Grasp, System, flexible_object
 from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.solvers import GaussNewton, Status, fit_problem
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
@@ -400,6 +401,17 @@ def light(tmp_path_factory):
         return compile_step(system, time_step, *NODE, use_compiler=False)
 
     return build
+
+
+def test_readings_at_a_slide_are_in_metres_and_newtons(tmp_path):
+    robot = chain_of_motors(tmp_path, z=("prismatic", "0 0 1"), turn=("continuous", "0 1 0"))
+    step = compile_step(System.build(robot, prescribed=robot.joint_names), 0.01, use_compiler=False)
+    t = 0.01 * np.arange(120)
+    group = JointGroup(robot.joint_names, t, np.stack([0.1 * t, t], 1), effort=np.ones((120, 2)), effort_std=0.1)
+    problem = EstimationProblem(step, [Recording(group, name="lift")], ["turn.damping"])
+    evaluation = problem.evaluate(problem.initial_unknowns)
+    seen = channel_predictions(problem.episodes[0], evaluation.episode_predictions[0])
+    assert {own.channel: own.unit for own in seen} == {"joints.effort.z": "N", "joints.effort.turn": "N m"}
 
 
 def moved_hands(step, duration):

@@ -409,13 +409,13 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         sensor = samples.sensor
         if sensor.effort_joints or samples.node.ndim > 1:
             continue
-        t = times_since_recording_start(episode, samples)
+        t, width = times_since_recording_start(episode, samples), sensor.outputs_per_channel
         for column, channel in enumerate(samples.channel_name_per_output):
             location = channel.rpartition(".")[2]
-            if sensor.outputs_per_channel > 1:
+            if width > 1:
                 location = sensor_bias_location_name(problem.system, sensor, sensor.frame_name_per_output[column])
             seen = samples.positive_weight_mask[:, column]
-            about = (episode.name, location, sensor.output_names[column], sensor.unit)
+            about = (episode.name, location, sensor.output_names[column], sensor.channel_units[column // width])
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], about)
     joints = episode.recording.joints
@@ -424,12 +424,13 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
     t = joints.t - episode.grid.start_time
     inside = (t >= 0) & (t <= episode.grid.node_times[-1] - episode.grid.start_time)
     for quantity in ("position", "effort"):
-        values, unit = joints.values_by_channel.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
+        values, revolute = joints.values_by_channel.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
         for column, joint in enumerate(joints.names):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
                 own = values[inside, column]
                 noise = np.full(len(own), max(floor, quantization_step(own)))
+                unit = problem.system.mechanism.joint(joint).unit(revolute)
                 yield from _alone(t[inside], own, noise, (episode.name, joint, f"joints.{quantity}.{joint}", unit))
 
 

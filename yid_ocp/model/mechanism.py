@@ -161,6 +161,10 @@ class Mechanism(ReprMixin):
         """Return a joint by name. Raises `ModelError`, with the nearest name, if there is no such joint."""
         return self.joints[self.joint_index(name)]
 
+    def units_at_joints(self, names: Iterable[str], revolute: str) -> tuple[str, ...]:
+        """Return the unit of a quantity at each named joint, which is `revolute` at a revolute joint."""
+        return tuple(self.joint(name).unit(revolute) for name in names)
+
     def has_frame(self, name: str) -> bool:
         """Check whether a frame of this name exists. `T1:40%` exists if there is a segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)

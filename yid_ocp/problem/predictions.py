@@ -111,7 +111,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
             at = slice(i * width, (i + 1) * width)
             t = times if times.ndim == 1 else times[:, i * width]
             own = (values[:, at] for values in (samples.value, predicted, samples.std))
-            found.append(ChannelPrediction(episode.name, channel, sensor.unit, t, *own))
+            found.append(ChannelPrediction(episode.name, channel, sensor.channel_units[i], t, *own))
     return tuple(found)
 
 

@@ -221,8 +221,13 @@ class Sensor(ABC):
 
     @property
     def unit(self) -> str:
-        """The unit of the sensor's readings."""
+        """The unit of the sensor's readings (at revolute joints)."""
         return self.channel.unit
+
+    @property
+    def channel_units(self) -> tuple[str, ...]:
+        """The unit of each channel's readings."""
+        return (self.unit,) * len(self.channel_names)
 
     @property
     def outputs_per_channel(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import casadi as ca
@@ -45,6 +45,11 @@ class JointSensor(Sensor):
 
     joint_names: tuple[str, ...]
     group_name: str
+    joint_units: tuple[str, ...] = field(default=(), kw_only=True)  # those of revolute joints if empty
+
+    @property
+    def channel_units(self) -> tuple[str, ...]:
+        return self.joint_units or super().channel_units
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -110,7 +115,8 @@ def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     later = (joints.t > around.node_times[0] + 1e-9) & (joints.t <= around.node_times[-1] + 1e-9)
     value = joints.position[later][:, recorded_joint_column_indices(joints, names, where)]
     std = np.broadcast_to(joint_angle_noise_std(joints, names, choice, where), value.shape)
-    return [SensorData(PositionSensor(names), joints.t[later], value, std)]
+    sensor = PositionSensor(names, joint_units=system.mechanism.units_at_joints(names, _POSITION.unit))
+    return [SensorData(sensor, joints.t[later], value, std)]
 
 
 @SENSOR_READERS.register(JOINT_EFFORT_SENSOR_KEY)
@@ -128,7 +134,8 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_SENSOR_KEY}.std")
     is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
-    sensor = PrescribedJointEffortSensor(names)
+    units = around.system.mechanism.units_at_joints(names, _EFFORT.unit)
+    sensor = PrescribedJointEffortSensor(names, joint_units=units)
     return [filtered_effort_sensor_data(around, sensor, joints.t, effort, std, bias, is_sample=is_sample)]
 
 

@@ -112,7 +112,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         known = samples.std[np.isfinite(samples.std)]
         noise[samples.sensor.group_name] = {
             "std": share * float(np.median(known)) if known.size else None,
-            "unit": samples.sensor.unit,
+            "unit": " or ".join(dict.fromkeys(samples.sensor.channel_units)),
         }
         group = samples.sensor.group_name
         if arm is not None and group == joints.JOINT_EFFORT_SENSOR_KEY:
@@ -156,9 +156,10 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     effort, position = joints.JOINT_EFFORT_SENSOR_KEY, joints.JOINT_POSITION_GROUP_NAME
     for group, noise_std in ((effort, joints.joint_torque_noise_std), (position, joints.joint_angle_noise_std)):
         choice = problem.options.sensors.get(group, SensorOptions())
+        units = problem.system.mechanism.units_at_joints(problem.system.driven, CHANNEL_KINDS[group].unit)
         noise[group] = {
             "std": float(np.median(noise_std(arm, problem.system.driven, choice, episode.name))),
-            "unit": CHANNEL_KINDS[group].unit,
+            "unit": " or ".join(dict.fromkeys(units)),
             "estimated": not joints.is_noise_std_stated(arm, group, choice),
         }
     noise[effort]["bias_std"] = float(np.median(errors.torque_bias_std))

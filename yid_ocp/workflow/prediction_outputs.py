@@ -245,8 +245,7 @@ def _store_sensor(
     parent: h5py.Group, episode: Episode, samples: SensorMeasurements, predicted: Mapping[str, Array]
 ) -> None:
     group = parent.create_group(samples.sensor.group_name)
-    store_texts(group, {"channels": samples.sensor.channel_names})
-    group.attrs["unit"] = samples.sensor.unit
+    store_texts(group, {"channels": samples.sensor.channel_names, "units": samples.sensor.channel_units})
     times = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
     _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
 

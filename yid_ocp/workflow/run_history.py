@@ -399,7 +399,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
                 for i, channel in enumerate(names):
                     own = (values[:, width * i : width * (i + 1)] for values in arrays)
                     times = t if t.ndim == 1 else t[:, width * i]
-                    found[name, channel] = ChannelPrediction(name, channel, str(group.attrs["unit"]), times, *own)
+                    found[name, channel] = ChannelPrediction(name, channel, str(group.attrs["units"][i]), times, *own)
     return found
 
 

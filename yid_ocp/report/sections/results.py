@@ -286,11 +286,11 @@ def _fitted_curves(own: _PredictedEpisode, noise_fraction: float) -> Iterator[tu
         for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
             curves: list[TimePlotData] = []
             for i in columns:
-                name = sensor.output_names[i].rsplit(".", 1)[1]
+                name, unit = sensor.output_names[i].rsplit(".", 1)[1], sensor.channel_units[i // width]
                 std = shares[i // width] * samples.std[:, i]
                 told = (t, samples.value[:, i], std, {"predicted": predicted[:, i]})
                 smooth = None if course is None else (grid.node_times, course[:, i])
-                curves += figures.channel_prediction_and_residual_plot_data(name, sensor.unit, *told, smooth)
+                curves += figures.channel_prediction_and_residual_plot_data(name, unit, *told, smooth)
             yield title, curves
 
 
