@@ -216,7 +216,7 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def attributes_to_dict(value: Any, names: str) -> dict[str, Any]:
-    """Return attributes of `value` as a dictionary. `names` lists them with blanks; `key=name` stores one as `key`."""
+    """Return attributes of `value` as a dictionary. `names` are separated by blanks. `key=name` stores one as `key`."""
     return {key: getattr(value, name or key) for key, _, name in [name.partition("=") for name in names.split()]}
 
 

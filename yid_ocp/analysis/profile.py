@@ -86,7 +86,7 @@ def solution_with_profile_intervals(
 
     The cost as a function of such a parameter is not quadratic, so a standard deviation does not describe it. The same
     holds for a stiffness that is small compared with its typical size (`mark_near_zero_estimate_unidentifiable`). If
-    the problem is too large for profiles, the solution is unchanged. Notes of its `checks` state better fits.
+    the problem is too large, the solution is unchanged. If a refit fits better, `checks.notes` of the result says so.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):

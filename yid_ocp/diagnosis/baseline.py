@@ -254,7 +254,7 @@ class _PredictionErrors:
         return bool(ratios) and min(ratios) < 1 - _MIN_RMSE_CHANGE and max(ratios) <= 1 + _MIN_RMSE_CHANGE
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionary as in `yid-diagnosis/2`."""
+        """Convert the errors to a dictionary: part `removed` or `added` of `counterfactual` in result.json."""
         rmse = {
             channel: {"without_diagnosis": before, "counterfactual": self.counterfactual[channel][0], "unit": unit}
             for channel, (before, unit) in self.without_diagnosis.items()

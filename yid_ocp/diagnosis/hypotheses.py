@@ -310,14 +310,14 @@ class AllCandidatesProblem:
     def problem_with_effects_and_relinearized_filters(
         self, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return the problem with free `effects` and filters of estimation recordings linearised for values `at`."""
+        """Return the problem with free `effects`, and whitening of estimation recordings linearised at values `at`."""
         own = self.problem_with_nominal_and_effects_free(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
     def relinearize_held_out_filters_of_problem(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return `own` (a problem with free `effects`) with filters of held-out recordings linearised at `at`."""
+        """Return `own` (with free `effects`), and whitening of held-out recordings linearised at values `at`."""
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))

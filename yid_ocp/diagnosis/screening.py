@@ -86,8 +86,8 @@ def linearize_candidates(
     """Linearise the residual with respect to the amplitudes of all candidates that are not yet in the model.
 
     The model contains the effects in `base`, with all their parameters free. `values` are the fitted unknowns of this
-    model. Returns P r, shape (nr,), and a signature for each candidate and grid value, both without the part that the
-    free parameters explain. Raises `SolverError` if the rollout at `values` fails.
+    model. Returns the residual (nr,) and a signature for each candidate and each trial value of its shape parameters,
+    both without the part that free parameters explain. Raises `SolverError` if the rollout at `values` fails.
     """
     labels = {effect.label for effect in base}
     tried = [effect for effect in problem.candidate_effects if effect.label not in labels]

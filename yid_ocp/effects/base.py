@@ -78,7 +78,7 @@ class EffectBase(Effect):
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
-    # what a motion must vary to distinguish the kind from others; the text continues "vary ..."
+    # what a motion must vary to distinguish the kind from others, a noun phrase such as "the speed"
     required_excitation: ClassVar[str] = "the motion"
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether the effect at one location implies nothing about other locations, as for a mass (unlike friction)

@@ -384,7 +384,7 @@ def covariance_of_scores(columns: Array, series: Sequence[OutputResidualIndices]
 
 
 def newey_west_covariance_of_scores(columns: Array, residual: Array, series: Sequence[OutputResidualIndices]) -> Array:
-    """Compute the covariance (p, p) of X'r for a residual of unknown autocorrelation (Newey and West 1987)."""
+    """Compute the covariance (p, p) of X'r, X = `columns`, if the rows of each series correlate (Newey, West 1987)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
         u = columns[s.residual_indices] * residual[s.residual_indices, None]

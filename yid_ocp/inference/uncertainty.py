@@ -581,12 +581,12 @@ class EstimateChecksBeyondFit:
         Standard deviation of every free parameter, without discretisation error.
     discretisation_shifts : mapping of str to EstimateShiftByDiscretisation
         Shift of every free parameter in each finer model that was tried.
-    notes, uncounted_errors : mapping of str to str, tuple of str
-        Notes on refinements or parameters; discretisations whose error the standard deviations do not include.
+    notes : mapping of str to str
+        Notes on finer discretisations or parameters. `uncounted_errors`: errors that standard deviations leave out.
     expected_prediction_errors : mapping of recording to mapping of channel to float
         Root mean square error of each held-out prediction expected from sensor and torque noise, in the channel's unit.
     step_stability : mapping
-        Growth of alternating errors at the `estimate`, and at the `start` of a search that failed.
+        Growth of errors whose sign alternates from step to step, at the `estimate` and at the `start` of a failed fit.
     """
 
     data_std: Mapping[str, float] = field(default_factory=dict)

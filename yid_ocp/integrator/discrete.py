@@ -120,7 +120,7 @@ class DiscreteEquations:
 
     @property
     def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """The impulses (n, 1) [N m s] that `force_with_derivatives` adds to `momentum_balance` and `p1`, or None."""
+        """Impulses (n, 1) [N m s] of `force_with_derivatives` in `momentum_balance` and `p1`. None if there is none."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares

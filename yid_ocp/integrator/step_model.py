@@ -201,7 +201,7 @@ class RolloutCostGradient:
     """The gradient of a scalar cost along a rollout, by the adjoint method. NaN if a step's equations are singular.
 
     It has the derivatives with respect to the chosen parameters, the initial state (nx,), the nominal torque (N, nu)
-    and the prescribed coordinates at every node (N + 1, nc). `by_initial_state` contains those at node 0.
+    and the prescribed coordinates at every node (N + 1, nc). Those at node 0 are also in `by_initial_state`.
     """
 
     by_theta: Array

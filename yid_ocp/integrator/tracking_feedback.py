@@ -276,11 +276,11 @@ class EffectMomentumCalculator:
 
 
 def applied_torque_derivative_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Compute how much an error of the recorded torque changes the applied torque (recorded plus feedback).
+    """Compute the derivative (..., nu, nu) of the applied torque (recorded plus feedback) by the recorded torque.
 
-    The result (..., nu, nu) includes the feedback, whose reference momenta follow from the recorded torque. The error
-    is assumed to be the same in this step and the previous step. `gain` (..., nu, nb) is the feedback gain of the step.
-    `by_torque` (nu, nu) is `EffectMomentumCalculator.momentum_derivative_by_previous_torque`.
+    An error of the recorded torque also changes the reference momentum of the feedback. It is assumed to be the same in
+    this step and the previous one. `gain` (..., nu, nb) is the feedback gain. `by_torque` (nu, nu) is the derivative of
+    the reference momentum by the torque (`EffectMomentumCalculator.momentum_derivative_by_previous_torque`).
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]

@@ -199,7 +199,7 @@ class UnknownVectorLayout:
         return result, own[count:]
 
     def pack_same_for_all_recordings(self, value_by_name: Callable[[str], float], start: Array) -> Array:
-        """Return the unknown vector (nx,) with equal local parameters and initial-state offsets in all recordings."""
+        """Return all unknowns: parameters by name, and the initial-state offsets `start` in each recording."""
         shared, local = (list(map(value_by_name, part)) for part in (self.shared_parameters, self.local_parameters))
         return np.array([*shared, *([*local, *start] * len(self.recording_names))], dtype=float)
 

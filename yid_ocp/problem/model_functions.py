@@ -75,10 +75,10 @@ class CorrectedInputs:
         names: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """Return a copy with the momentum that effects add to the tracking filter's reference in every step.
+        """Return a copy that stores the momentum which effects add to the tracking filter's reference in every step.
 
-        `recorded` has smoothed angles; `measured` (N + 1, nu) are the angles without smoothing. `by_internal` (nz, d)
-        is the derivative of the initial internal coordinates.
+        `shift` computes it for `theta`, with derivatives in d directions, first by the parameters `names`. `recorded`
+        has smoothed angles, `measured` (N + 1, nu) not. `by_internal` (nz, d): of the initial internal coordinates.
         """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)

@@ -161,7 +161,7 @@ def next_steps_table(result: Mapping[str, Any], steps: Mapping[str, str]) -> Sum
 
 
 def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
-    """Return what recorded torques that a result does not use could tell. Empty if there are none."""
+    """Return a sentence on the use of recorded torques, if a result does not use them. Empty otherwise."""
     use = "Recorded torques are not used. For friction, set sensors.joints.effort.use: true and run `yid-ocp friction`."
     return use if result.get("unused_efforts") else ""
 
@@ -252,7 +252,7 @@ def large_torque_offsets_sentence(result: Mapping[str, Any]) -> str:
 
 
 def torque_offset_table(result: Mapping[str, Any]) -> SummaryTable:
-    """Return a table of a result's torque offsets, with a row for each joint, for the page only."""
+    """Return a table of a result's torque offsets, with a row for each joint. Only the HTML report shows it."""
     shown: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     rows: TableRows = [("joint", *shown, "expected size")]
     for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):

@@ -134,7 +134,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_mask_function_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Return a function from world points (N, 3) to the mask (N,) of those in the region. `camera`: position."""
+        """Return a function that marks world points (N, 3) in the region at `q`, seen from the position `camera`."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:

@@ -174,7 +174,7 @@ class ArticulatedSurfaces:
         return result
 
     def nearest_moving_surfaces(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Return distance [m], normal towards the point and part of the nearest moving surface; inf, 0, -1 if none."""
+        """Return distance [m], normal (to the point), index of the nearest moving part; inf, 0, -1 beyond `within`."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at_configuration(q)):
