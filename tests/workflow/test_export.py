@@ -11,7 +11,9 @@ import pytest
 
 from yid_ocp.config.reader import SHIPPED_DIAGNOSIS_CONFIG_FILE_NAME, load_config
 from yid_ocp.config.settings import config_yaml_with_defaults
+from yid_ocp.data import JointGroup, Recording
 from yid_ocp.virtual.mujoco_simulation import replay_mismatch_by_channel
+from yid_ocp.workflow import export
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
@@ -247,3 +249,21 @@ def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path, export
     text = (tmp_path / "pendulum.xml").read_text(encoding="utf-8")
     # noise that the recording does not state is smoothed: differentiated twice, it would be many times the torques
     assert replay_mismatch_by_channel(text, build_system(run), noisy)["joints.effort"].rmse < 0.6
+
+
+def test_a_servo_has_the_gain_that_the_recording_states(tmp_path, urdf_folder) -> None:
+    config = tmp_path / "servo.yaml"
+    robot = urdf_folder / "double_pendulum.urdf"
+    arms = f"model: {{robot: {robot}, arms: {{mode: servo, servo: {{motor: {{kind: dc}}}}}}}}\n"
+    stated = "parameters: {shoulder.servo_gain_factor: {initial: 7.0}}\n"
+    joints = JointGroup(("shoulder", "elbow"), np.arange(3.0), np.zeros((3, 2)), position_command=np.zeros((3, 2)))
+    recording = Recording(replace(joints, proportional_gain=400.0), name="firmware")
+    for text, factors in ((arms, {"shoulder": 400.0, "elbow": 400.0}), (arms + stated, {"elbow": 400.0})):
+        config.write_text(text, encoding="utf-8")
+        run = load_config(config)
+        values = {p.name: p.value for p in build_system(run).parameters} | {"elbow.servo_gain": 0.01}
+        model = export._CalibratedModel(run, run, values, {})
+        [gains] = model.servo_gains([recording])
+        assert gains == {f"{joint}.servo_gain_factor": factor for joint, factor in factors.items()}
+        root = ElementTree.fromstring(model.with_values(gains).text("mjcf", model.system(())))
+        assert float(root.find("actuator/*[@name='elbow']").get("gainprm")) == pytest.approx(4.0)

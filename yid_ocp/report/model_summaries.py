@@ -126,6 +126,9 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
     text = f"Do not rely on these values in the file, which the run did not find: {abbreviated_names_text(unknown)}."
     yield SummaryStatement(text if unknown else "", "verdict")
+    gain_of = manifest.get("gain_of")
+    text = f"The gains in the file are those of servos whose firmware has the gain stated in '{gain_of}'."
+    yield SummaryStatement(text if gain_of else "", "verdict")
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     alike = grouped(((kind_of_part(name), kinds[own["status"]], own["how"]), name) for name, own in entries)
     rows: TableRows = [("part of the model", "in the file", "how, or why not")]

@@ -30,6 +30,7 @@ from yid_ocp.export.signals import (
 )
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
+from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.report.terminal import recording_summary_lines, summary_blocks, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
@@ -118,6 +119,17 @@ class _CalibratedModel:
     def values_for(self, system: System) -> dict[str, float]:
         return {name: value for name, value in self.parameter_values.items() if name in system.parameters}
 
+    def servo_gains(self, recordings: Sequence[Recording]) -> list[dict[str, float]]:
+        """Return the servo gains that each recording states, by parameter, without those that the settings state."""
+        system = build_system(self.settings)
+        gains = servo_gain_parameters_by_recording(system, recordings)
+        stated = {n for n, own in settings_by_parameter_name(self.settings, system.parameters).items() if own.initial}
+        return [{n: x for n, x in gains.get(r.name, {}).items() if n not in stated} for r in recordings]
+
+    def with_values(self, values: Mapping[str, float]) -> _CalibratedModel:
+        """Return the model with some other parameter values."""
+        return replace(self, parameter_values={**self.parameter_values, **values})
+
     def text(self, form: str, system: System) -> str:
         values = self.values_for(system)
         if form == "mjcf":
@@ -166,6 +178,9 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         write_text(out, config_yaml_with_defaults(replace(calibrated.settings, parameters=chosen)))
         head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
         return head | {"unknown": unknown, "effects": {}, "parameters": {}, "gate": None}
+    first = (read_recordings_of_role(calibrated.settings, "estimate") if full.servos else [])[:1]
+    gains = calibrated.servo_gains(first)
+    calibrated = calibrated.with_values(dict(*gains))
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasps = {g.name: _grasp_support(form, supports.get(f"grasp_compliance@{g.name}")) for g in full.grasps}
@@ -185,6 +200,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "parameters": parameters,
         "unknown": unknown,
         "grasps": {name: vars(entry) for name, entry in grasps.items()},
+        "gain_of": first[0].name if any(gains) else None,
         "gate": None,
         "versions": software_and_plugin_versions(),
     }
@@ -269,12 +285,14 @@ def _gate(calibrated: _CalibratedModel, system: System, progress: Progress) -> d
         nominal = calibrated.system([effect.label for effect in system.effects], nominal=True)
         system, nominal = (_with_recorded_points(own, recordings) for own in (system, nominal))
         recordings = [_with_configured_noise(own, nominal, calibrated.settings.sensors) for own in recordings]
-        before = _replayed(mujoco_xml(nominal, standalone=True), nominal, recordings, progress)
-        after = _replayed(calibrated.text("mjcf", system), system, recordings, progress, 1)
+        gains = calibrated.servo_gains(recordings)
+        before = [mujoco_xml(nominal, own, standalone=True) for own in gains]
+        after = [calibrated.with_values(own).text("mjcf", system) for own in gains]
+        errors = [_replayed(before, nominal, recordings, progress), _replayed(after, system, recordings, progress, 1)]
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": ". Try: ".join(filter(None, (error.what, error.hint)))}
     kept = "unit noise=noise_rms after=rmse"
-    channels = {n: attributes_to_dict(own, kept) | {"before": before[n].rmse} for n, own in after.items()}
+    channels = {n: attributes_to_dict(own, kept) | {"before": errors[0][n].rmse} for n, own in errors[1].items()}
     return {
         "status": "done",
         "which": which,
@@ -312,10 +330,10 @@ def _stated_std(choice: SensorOptions, names: Sequence[str], recorded: float | A
 
 
 def _replayed(
-    text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
+    texts: Sequence[str], system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
 ) -> dict[str, ReplayErrorAgainstRecording]:
     found: dict[str, list[ReplayErrorAgainstRecording]] = {}
-    for i, recording in enumerate(recordings):
+    for i, (text, recording) in enumerate(zip(texts, recordings, strict=True)):
         own = f"{recording.name}{' as exported' * round_}"
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), own)
         for name, error in replay_mismatch_by_channel(text, system, recording).items():
