@@ -121,6 +121,8 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     rows = "".join(f"{x:.3f},{y:.3f},{z:.3f},0\n" for x, y, z in turned)
     (odd / "mocap.csv").write_text("time,tip X,tip Y,tip Z\n" + rows)
     *_, said = printed("import", *BOTH, "--preview").strip().splitlines()
+    twice = printed("import", "joints.csv", "joints.csv", "--preview")
+    assert "the files are not parts of one recording: " in twice
     told = printed(*shlex.split(said)[1:])
     assert "position [rad], velocity [rad/s], effort [N m]" in told
     assert "have one clock" in told

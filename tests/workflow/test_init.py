@@ -196,7 +196,9 @@ def test_the_last_frame_of_the_arm_holds_the_object(bench: Path, capsys: pytest.
         assert f"{holder}  other choices for --holder: {others}" in re.sub(" {2,}", "  ", capsys.readouterr().out)
 
 
-def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path) -> None:
+def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     link = '<link name="{0}"/><joint name="{0}" type="{1}"><parent link="hub"/><child link="{0}"/>{2}</joint>'
     more = link.format("finger", "prismatic", '<limit lower="0" upper="0.04" effort="9" velocity="1"/>')
     more += link.format("hub_tcp", "fixed", "") + "</robot>"
@@ -204,7 +206,10 @@ def test_a_finger_that_rests_is_locked_and_its_hand_holds_the_object(bench: Path
     made = moved(SHORT)
     for opening, holder, locked in ((np.full(len(SHORT), 0.01), "hub_tcp", {"finger": 0.01}), (SHORT, "finger", {})):
         position = np.column_stack([made.joints.position, opening])
-        model = proposed(replace(made, joints=JointGroup((*made.joint_names, "finger"), SHORT, position))).model
+        names = (*made.joint_names, "finger", "gantry")
+        position = np.column_stack([position, SHORT])
+        model = proposed(replace(made, joints=JointGroup(names, SHORT, position))).model
+        assert f"recorded, but not used: {'finger, ' * bool(locked)}gantry" in capsys.readouterr().out
         assert (model.object.mount.parent_frame, model.arms.locked_joints) == (holder, locked)
 
 

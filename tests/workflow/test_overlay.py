@@ -77,5 +77,6 @@ def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
     result |= {"channels": [channel | {"difference": 0.5}], "model_difference": "object", "poor": ["b"]}
     lines = summary_terminal_lines(summary_blocks(result))
     assert "k          –  2.5 ± 0.1  N m/rad" in lines
+    assert "No parameter can be compared" in lines[0]
     assert "The model did not explain the recordings of b." in " ".join(lines)
     assert "The models differ (model.object), so a parameter may differ" in " ".join(lines)

@@ -186,7 +186,9 @@ def recorded_joint_column_indices(joints: RecordedJointsInterface, names: tuple[
         if name not in joints.names:
             what = f"joint '{name}' of the model is not recorded"
             others, allowed = [own for own in joints.names if own not in names], ", ".join(joints.names)
-            hint = nearest_name_question(name, others) or "record it, or leave it out of model.arms.joints"
+            hint = "record it, or leave it out of model.arms.joints"
+            if near := nearest_name_question(name, others):
+                hint = f"{near} If so, import the file again with --joints RECORDED={name}, which renames it"
             raise DataError(what, where=f"recording '{where}': joints", allowed=allowed, hint=hint)
     return [joints.names.index(name) for name in names]
 

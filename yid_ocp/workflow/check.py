@@ -50,7 +50,9 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         folder.record_run_start(run, "check")
         warnings: list[str] = []
         progress.begin_stage("building the model")
-        step = build_step(run)
+        step, item = build_step(run), run.model.object
+        dense = "" if item is None else item.implausible_density_text
+        warnings += [f"{dense}, but materials have 5 to 20000. Correct its mass [kg] or sizes [m]"] if dense else []
         recordings, problem = [], None
         if run.recordings.estimate:
             progress.begin_stage("placing the recordings on the model")

@@ -115,6 +115,8 @@ def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: 
     try:
         recording = _read(files, options, progress)
     except DataError as error:
+        if len(files) > 1:
+            return ["", f"the files are not parts of one recording: {error.what}"]
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
     what = "it" if len(files) == 1 else "them as one recording"

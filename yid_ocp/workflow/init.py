@@ -127,13 +127,9 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         what, hint = f"the object '{word}' has no branches", "write --object tree, or leave --branch out"
         raise ConfigError(what, where="--branch", allowed="--branch with --object tree", hint=hint)
     item = template.build({name: value for name, value in given.items() if value}, links)
-    for own in item.settings.segment_definitions():
-        width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
-        density = own.mass / (own.length * width * height)
-        if density < 5 or density > 20_000:
-            what, allowed = f"'{own.name}' has the density {density:.2g} kg/m^3", "5 (foam) to 20000 kg/m^3 (tungsten)"
-            hint = "give the mass in kg, and the length and the radius (or --section) in m"
-            raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint=hint)
+    if what := item.settings.implausible_density_text:
+        allowed, hint = "5 (foam) to 20000 kg/m^3 (tungsten)", "give the mass in kg, and lengths and radii in m"
+        raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint=hint)
     return item
 
 
@@ -205,9 +201,11 @@ def _summary_lines(
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
     carried = "object" if proposal.has_object else "payload (estimated, as no --object is given)"
+    unused = {"recorded, but not used": proposal.unused_joints, "not recorded": proposal.unrecorded_joints}
+    rest = "; ".join(f"{words}: {abbreviated_names_text(names)}" for words, names in unused.items() if names)
     rows: TableRows = [
         ("setting", "choice", "reason, or other choices"),
-        ("model.arms.joints", abbreviated_names_text(proposal.joints, math.inf), ""),
+        ("model.arms.joints", abbreviated_names_text(proposal.joints, math.inf), rest),
         (f"frame of the {carried}", ", ".join(held), f"other choices for --holder: {', '.join(others)}" * bool(others)),
         ("model.arms.mode", proposal.arm_mode, proposal.arm_mode_reason),
         ("problem.initial_state", proposal.initial_state, proposal.initial_state_reason),

@@ -251,6 +251,16 @@ class ObjectBuilder:
         texts = [f"{self.segment_key.format(s.name)}.{count}" for s, count in zip(halved, counts, strict=True)]
         return tuple(dict.fromkeys(texts))
 
+    @property
+    def implausible_density_text(self) -> str:
+        """A sentence part with the name and the density of a segment that no material has; empty if there is none."""
+        for own in self.segment_definitions():
+            width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
+            density = own.mass / (own.length * width * height)
+            if density < 5 or density > 20_000:
+                return f"'{own.name}' has the density {density:.2g} kg/m^3"
+        return ""
+
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Return the factor on a parameter that keeps its segment as stiff and damped if each link is divided."""
         owner, _, quantity = parameter.rpartition(".")
