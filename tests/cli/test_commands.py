@@ -249,7 +249,7 @@ def test_check_refines_links_and_time_step(carried_out, written):
     assert abs(finest - exact) < 0.05 * exact
     assert abs(finest - exact) < abs(coarsest - exact)
     assert "warning: natural frequencies change by more than 2 % when" in done.out
-    heavy = carried_out("check", file, "--set", "model.object.named_segments.beam.mass=300")
+    heavy = carried_out("check", file, "--set", "model.object.named_segments.beam.mass=300", out="heavy")
     assert "'beam' has the density 1.9e+06 kg/m^3" in heavy.out
     assert "density" not in done.out
 
