@@ -103,13 +103,13 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
 
 
 def _gauss_newton_step_in_finer_model(
-    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation
+    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation, has_other_motion: bool = False
 ) -> tuple[dict[str, float], Array, Evaluation] | str:
     """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
     Returns the shift of each shared free parameter, the linearised residual after the step and the fine evaluation, or
-    a message if the step fails. `at_x` is the coarse evaluation at `x`. With process noise, or the same links and
-    samples, Jacobian and priors are coarse.
+    a message if the step fails. `at_x` is the coarse evaluation at `x`. With process noise, or the same links, samples
+    and prescribed motion, Jacobian and priors are coarse.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -118,7 +118,8 @@ def _gauss_newton_step_in_finer_model(
     own, other = problem.residual_rows, coarse.residual_rows
     if weighted and own.measurements != other.measurements:
         return "the finer model would use other samples of the recordings"
-    is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
+    is_refined = refined.subdivided_joints or has_other_motion
+    is_alike = weighted or (not is_refined and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
     if not evaluation.ok:
@@ -399,7 +400,7 @@ def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Ev
     has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
     for _ in range(_N_NOISE_DRAWS if has_encoders and system.unprescribed_coordinate_indices else 0):
         noisy = _FinerModel(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
-        made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x)
+        made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x, has_other_motion=True)
         moves += [] if isinstance(made, str) else [made[0]]
     shifts = {name: np.array([own[name] for own in moves]) for name in problem.shared_parameters if moves}
     return {name: math.copysign(math.hypot(own.mean(), own.std() / 2), own.mean()) for name, own in shifts.items()}
