@@ -381,8 +381,8 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     joint = held_out_loss(problem, np.zeros(1), np.array([[2.0]]))
     shift = -14 / (11 + 1 / 4)
     residual = found.total_chi2 + 2 * 14 * shift + 11 * shift**2
-    assert joint.total_chi2 == found.total_chi2 == found.added_joint_fit_chi2
-    assert joint.added_joint_fit_chi2 == pytest.approx(residual + (shift / 2) ** 2)
+    assert joint.total_chi2 == found.total_chi2 == found.updated_chi2
+    assert joint.updated_chi2 == pytest.approx(residual + (shift / 2) ** 2)
 
 
 @cases(

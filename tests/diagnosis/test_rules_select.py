@@ -468,6 +468,9 @@ def test_where_noise_is_left_all_recordings_are_one_likelihood():
     # uncertain parameters predict badly; a fit to all recordings would change them
     updated = replace(spring, held_out_loss=replace(spring.held_out_loss, updated_chi2=150.0))
     assert select.bic_difference(updated, spring) == pytest.approx(150.0 - spring.held_out_loss.total_chi2)
+    # the contradiction of a baseline is already a part of the cost
+    shifted = replace(spring, held_out_loss=replace(spring.held_out_loss, baseline_chi2=9.0))
+    assert select.bic_difference(shifted, spring) == 0.0
     assert nearest([spring, replace(offset, cost=101.5)]) == ["spring@elbow", "offset@elbow"]
     # up to odds of 150 to 1, half as sure as the difference
     assert nearest([spring, replace(offset, cost=111.2)]) == ["spring@elbow", "offset@elbow"]

@@ -56,7 +56,7 @@ def bic_difference(fit: RefitStatistics, other: RefitStatistics, more: int = 0) 
     The BIC is the smallest r'r of a fit to estimation and held-out recordings (r: whitened residual) plus log(n) per
     effect parameter, with n residuals (Schwarz 1978, doi:10.1214/aos/1176344136). `more` parameters of `fit` count too.
     """
-    held = fit.held_out_loss.added_joint_fit_chi2 - other.held_out_loss.added_joint_fit_chi2
+    held = fit.held_out_loss.updated_chi2 - other.held_out_loss.updated_chi2
     more += fit.total_effect_parameter_count - other.total_effect_parameter_count
     return held + 2 * (fit.cost - other.cost) + more * math.log(max(fit.residual_count, 1))
 

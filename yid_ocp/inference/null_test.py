@@ -197,7 +197,7 @@ class HeldOutLoss:
     block_chi2: Array  # sums of whitened squares; infinite if a rollout failed
     block_sample_counts: Array
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
-    updated_chi2: float  # what the blocks add to chi2 if all parameters are fitted to them, too
+    updated_chi2: float  # what the blocks add to chi2 of a fit to all recordings, in the linear model
     # chi2 of the deviation from a baseline, which does not depend on the resampled blocks
     baseline_chi2: float = 0.0
 
@@ -205,11 +205,6 @@ class HeldOutLoss:
     def total_chi2(self) -> float:
         """The sum of chi2 over all held-out time blocks, plus chi2 of the deviation from earlier runs."""
         return float(self.block_chi2.sum()) + self.baseline_chi2
-
-    @property
-    def added_joint_fit_chi2(self) -> float:
-        """What these recordings add to the smallest chi2 of a fit to all recordings, in the linear model."""
-        return self.updated_chi2 + self.baseline_chi2
 
     @property
     def chi2_per_sample(self) -> float:
