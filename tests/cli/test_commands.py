@@ -341,7 +341,7 @@ def test_check_compares_no_mjcf_file_with_a_library_that_reads_urdf(printed, tmp
     (tmp_path / "arm.yaml").write_text("model: {robot: arm.xml, arms: {joints: [j], mode: driven}}\n")
     told = printed("check", tmp_path / "arm.yaml", "--out", tmp_path / "m", "--set", "output.write_report=false")
     assert "is not compared" not in told
-    assert "confirms the masses, inertias and kinematics of this model" in " ".join(told.split())
+    assert "computes the same masses, inertias and kinematics for this model" in " ".join(told.split())
 
 
 def test_what_is_simulated_is_exported_and_imported(printed, pendulum_data, tmp_path):

@@ -118,9 +118,9 @@ def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carri
     """The same pendulum with its noise stated ten times too small."""
     settings = (*NO_REPORT, "sensors={joints.effort: {std: 0.001}}", "compare.methods={gauss_newton: {}}")
     done = carried_out(command, pendulum, settings=settings)
-    doubt, _, text = " ".join(done.out.split()).partition("The model does not explain the recordings either: chi2 ")
+    doubt, _, text = " ".join(done.out.split()).partition("The model does not explain the recordings: chi2 ")
     assert text.partition(" First follow the advice above.")[0].endswith("; noise alone gives 1.")
-    assert not doubt or doubt.startswith("Use no value of a fit yet, because a channel has more ")
+    assert not doubt or doubt.startswith("Do not use estimates yet, because a channel has more ")
     assert "in doubt" in done.out
     result = done.result
     own = result["methods"]["gauss_newton"] if command == "compare" else result

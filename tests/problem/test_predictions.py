@@ -157,6 +157,8 @@ def solution(problem):
 def test_the_method_that_is_not_named_is_gauss_newton(problem, solution):
     assert solution.solver_name == "gauss_newton"
     assert np.array_equal(solution.x, yid.solve(problem, yid.GaussNewton()).x)
+    with pytest.raises(ConfigError, match=r"(?s)the text 'gauss_newton'.*yid_ocp\.GaussNewton\(\)"):
+        yid.solve(problem, "gauss_newton")
 
 
 def test_a_value_that_cannot_be_found_is_not_shown(solution):

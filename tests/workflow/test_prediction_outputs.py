@@ -240,7 +240,7 @@ def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum
     assert result["fit"]["data_trusted"] is believed
     assert [doubt["cause"] for doubt in result["issues"]] == ([] if believed else ["worse_than_guess"])
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
-    assert ("a guess without a model has a smaller error" in done.out) is not believed
+    assert ("a prediction without a model has a smaller error" in done.out) is not believed
 
 
 def test_a_group_without_a_sample_has_no_expected_error():

@@ -59,10 +59,10 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out
     assert ({doubt["cause"] for doubt in result["issues"]}, result["fit"]["data_trusted"]) == ({"noise"}, False)
     free = [entry for entry in result["parameters"].values() if entry["free"]]
     assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
-    for words in ("Use no value of a fit yet, because ", "joints.effort.std=0.1", "/joints/effort."):
+    for words in ("Do not use estimates yet, because ", "joints.effort.std=0.1", "/joints/effort."):
         assert words in done.out
     page = (done.folder / "report.html").read_text()
-    assert all(text in page for text in ("Use no value of a fit yet, because ", "a channel has more noise than stated"))
+    assert all(text in page for text in ("Do not use estimates yet, because ", "a channel has more noise than stated"))
 
 
 def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):

@@ -15,6 +15,7 @@ from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import LIMIT_VIOLATION_RATIO_CAP, QUALITY_LIMITS, Issue
 from yid_ocp.display import NULL_PROGRESS, Progress, count_with_noun, grouped
+from yid_ocp.errors import ConfigError
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
@@ -57,6 +58,9 @@ def solve(
     callback : callable, optional
         Receives every `Iterate`.
     """
+    if isinstance(solver, str):
+        what, allowed = f"the solver is the text '{solver}'", "a solver object, such as yid_ocp.GaussNewton()"
+        raise ConfigError(what, where="solver", allowed=allowed, hint="leave it out for Gauss-Newton")
     if initial_unknowns is not None:
         checked_unknowns(problem, initial_unknowns, "initial_unknowns")
     solver, limits = solver or GaussNewton(), problem.options.excess_residual_criteria
@@ -356,8 +360,8 @@ def _worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Map
             best = min(rms, key=rms.__getitem__, default="")
             guess, unit = rms.get(best, np.inf), units[channels[0]]
             if error > _WORSE_RATIO * guess:
-                what = f"the model's rms error is {error:.3g} {unit}, but the guess '{BASELINE_DESCRIPTIONS[best]}' "
-                what += f"has {guess:.3g} {unit} ({_WORSE_RATIO:g} times this is tolerated)"
+                what = f"the model's rms error is {error:.3g} {unit}, that of '{BASELINE_DESCRIPTIONS[best]}' only "
+                what += f"{guess:.3g} {unit} (up to {_WORSE_RATIO:g} times this is tolerated)"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else LIMIT_VIOLATION_RATIO_CAP
                 advice = "look at the residuals in the report, and run `yid-ocp diagnose` to find what the model lacks"
                 at = (entry["recording"], *group.partition(".")[::2])

@@ -36,6 +36,7 @@ JOINT_NOISE_AND_SERVO_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "pro
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")  # pattern of allowed names of point groups
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
+_POINT_ARRAY = "a row for each time, an entry for each point, 3 coordinates"
 _LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}
 """Largest accepted values by unit: eight turns, which angles in degrees nearly always exceed, or beyond any machine."""
 _LARGEST_SPREAD = 1e9  # its square is finite
@@ -416,7 +417,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     _check_names_and_clock(joints, where)
     for channel, value in joints.values_by_channel.items():
         place = f"{where}/{channel}"
-        _check_shape(value, (len(joints.t), len(joints.names)), place, "(N, nj)")
+        _check_shape(value, (len(joints.t), len(joints.names)), place, "a row for each time, a column for each joint")
         is_effort = channel in ("effort", "external_effort")
         bad = np.isinf(value) if is_effort and allow_nan_effort else ~np.isfinite(value)
         if bad.any():
@@ -440,7 +441,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     for name in JOINT_NOISE_AND_SERVO_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
-            _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
+            _validate_std(std, len(joints.names), name, place, "one number, or one for each joint")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
         what, hint = f"effort_kind is '{joints.effort_kind}', which is unknown", "leave the attribute out if in doubt"
@@ -450,7 +451,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
 def _validate_points(group: PointGroup, where: str) -> None:
     _check_names_and_clock(group, where)
     _check_text(where, ("sensor", group.sensor_name), ("frame", group.frame))
-    _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", "(M, np, 3)")
+    _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", _POINT_ARRAY)
     unseen = np.isnan(group.position).all(axis=2)
     if (bad := ~np.isfinite(group.position).all(axis=2) & ~unseen).any():
         row, column = (int(index[0]) for index in np.nonzero(bad))
@@ -460,7 +461,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
         raise DataError(what, where=f"{where}/position", allowed=allowed, hint=hint)
     _check_distances(group.position[~unseen], f"{where}/position")
     if group.std is not None:
-        _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
+        _check_shape(group.std, group.position.shape, f"{where}/std", f"one number, or {_POINT_ARRAY}")
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {next(iter(wrong), 0.0):g} m"
@@ -493,16 +494,16 @@ def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
-        _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
+        _check_shape(values, shape, f"{where}/{quantity}", "a row for each time, an entry for each name")
         what, hint = f"{quantity} has a value that is not finite", "remove the samples in which a value is missing"
         raise_data_error_unless(np.isfinite(values).all(), what, f"{where}/{quantity}", "finite numbers", hint)
     for name, std in stds.items():
-        _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
+        _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number, or one for each name")
 
 
-def _validate_std(std: float | Array, count: int, name: str, where: str, letters: str) -> None:
+def _validate_std(std: float | Array, count: int, name: str, where: str, allowed: str) -> None:
     if np.ndim(std) > 0:
-        _check_shape(np.asarray(std), (count,), where, letters)
+        _check_shape(np.asarray(std), (count,), where, allowed)
     good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
     raise_data_error_unless(good, f"{name} is {std}", where, f"0 to {_LARGEST_SPREAD:g}", f"leave {name} out if unsure")
 
@@ -510,7 +511,7 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
     allowed, hint = "`straight` together with a group of points", "add the group of points, or leave `straight` out"
     raise_data_error_unless(groups, "the recording has `straight`, but no group of points", where, allowed, hint)
-    _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
+    _check_shape(straight, (len(groups[0].names), 3), where, "a row for each point of the first group, 3 coordinates")
     what, hint = "`straight` has a position that is not finite", "measure all points, or leave `straight` out"
     raise_data_error_unless(np.isfinite(straight).all(), what, where, "finite coordinates of every point [m]", hint)
     _check_distances(straight, where)
@@ -562,11 +563,9 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         raise DataError(what, where=f"{where}/t", allowed=allowed, hint=hint)
 
 
-def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    what, allowed = f"the array has shape {array.shape}, but must have {shape}", f"{letters}, as in recordings.md"
-    entries = "write one row for each time, one entry for each name"
-    entries += f", and {shape[-1]} components of each" * (len(shape) > 2)
-    hint = "transpose it" if array.shape[::-1] == shape else entries
+def _check_shape(array: Array, shape: tuple[int, ...], where: str, allowed: str) -> None:
+    what = f"the array has shape {array.shape}, but must have {shape}"
+    hint = "transpose it" if array.shape[::-1] == shape else "correct the array, or the times and names beside it"
     raise_data_error_unless(array.shape == shape, what, where, allowed, hint)
 
 

@@ -174,7 +174,7 @@ def read_urdf(
         carried = merge_inertias(own.values())
         if carried is not None:
             mass = float(carried.mass)
-            parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
+            parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of the link behind {entry}")
             parameters.append(parameter)
             carried = replace(carried.scaled_by(parameter.symbol / mass), mass=parameter.symbol)
             bodies |= {link: body.scaled_by(parameter.symbol / mass) for link, body in own.items()}

@@ -47,7 +47,7 @@ _FOUND_VERDICTS = ("identifiable", "weak")
 """Verdicts of parameters whose values are shown."""
 _MIN_STATED_PROBABILITIES = 10  # number of them from which they are compared with the outcomes
 _MIN_CONCLUSIVE_CASES = 30  # cases of a blind test from which its numbers are shown without a warning
-_SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times counted in samples"}
+_SIGNAL_TEXTS = {"camera": "points of a camera", "nominal_clock": "times that count samples instead of reading a clock"}
 _MAX_RUN_DIFFERENCE = 2  # difference of two runs above which a parameter is named [std]
 
 
@@ -468,18 +468,18 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     drifted = [name for name, entry in result["parameters"].items() if entry["drifted"]]
     wrong = [entry["name"] for entry in runs if entry["distrusted"]]
     poor = [entry["name"] for entry in runs if not entry["explains"]]
-    doubtful = f"; the ± of {abbreviated_names_text(poor)} is large, as the model does not explain the recordings"
+    doubtful = f" The model does not explain the recordings of {abbreviated_names_text(poor)}, so their ± is large."
     if not drifted and result["p_value"] >= result["level"]:
-        yield f"All runs agree within their uncertainty (noise alone: p {p}{doubtful * bool(poor)})."
+        yield f"All runs agree within their uncertainty (p-value {p}).{doubtful * bool(poor)}"
     elif not drifted:
-        yield f"All parameters together differ between the runs (noise alone: p {p}), but no single parameter does."
+        yield f"All parameters together differ between the runs (p-value {p}), but no single parameter does."
     for name in drifted:
         entry = result["parameters"][name]
         (low, first), *_, (high, last) = sorted((own["value"], run) for run, own in entry["values"].items())
         places = (f" in {first}", f" in {last}") if len(runs) > 2 else ("", "")
         said = f"{name} differs between the runs, from {low:.4g}{places[0]} to {high:.4g} {entry['unit']}{places[1]}"
         limit = f"below {result['level'] / len(result['parameters']):.2g} counts as a difference"
-        yield f"{said} (noise alone: p {p_value_text(entry['p_value'], '= ')}; {limit})."
+        yield f"{said} (p-value {p_value_text(entry['p_value'], '= ')}; {limit})."
     if wrong:
         names = " and ".join(wrong)
         rest = [entry["name"] for entry in runs if not entry["distrusted"]]

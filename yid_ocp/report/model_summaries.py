@@ -31,7 +31,7 @@ _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an eq
 @SUMMARIES.register("yid-inspect/1")
 def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
-    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
+    counts = [f"{roles.count(role)} {role}" for role in ("driven", "servo", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
     asked, entries = result["asked"] or result["dependence"], result["entries"]
     is_formula_asked = bool(entries) and not result["asked"]

@@ -109,7 +109,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         shown = [value_text_and_display_unit(size, entry["unit"]) for size in sizes]
         rows.append((name, *(text for text, _ in shown), shown[0][1], str(entry["n"])))
     has_others = any(entry["rmse"] for entry in result["held_out"])
-    yield SummaryTable(rows, "Errors (rms; of points: distance) on the fitted recordings", is_page_only=has_others)
+    yield SummaryTable(rows, "Errors on fitted recordings (rms; of points: of the distance)", is_page_only=has_others)
     yield from _held_out_blocks(result)
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
@@ -508,7 +508,7 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     texts = (f"in {abbreviated_names_text(own)}, {what}" if own else what for what, own in alike.items())
     yield from (SummaryStatement(f"warning: {text}.", "verdict") for text in texts)
     agreed = " and ".join(entry["of"] for entry in result["mechanics"].values() if entry["agrees"])
-    yield f"The library Pinocchio confirms the masses, inertias and kinematics of {agreed}." if agreed else ""
+    yield f"The library Pinocchio computes the same masses, inertias and kinematics for {agreed}." if agreed else ""
     rows: TableRows = [("recording", "use", "group", "samples", "median rate", "longest gap")]
     noise = dict[Sequence[str], list[str]]()  # names of the recordings by noise of a channel
     apart = dict[str, list[str]]()  # names of the recordings by gaps of their grasps

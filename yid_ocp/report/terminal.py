@@ -141,7 +141,7 @@ def issue_summary_blocks(result: Mapping[str, Any], *, with_verdict: bool = True
         text = f"{where} ({first['certainty']}):{example} {first['what']}. {do[0].upper()}{do[1:]}"
         advice += [text, CodeBlock("\n".join(options))]
     if (severe := issue_descriptions(result, severe=True)) and with_verdict:
-        yield SummaryStatement(f"Use no value of a fit yet, because {severe}.", "verdict")
+        yield SummaryStatement(f"Do not use estimates yet, because {severe}.", "verdict")
     if (mild := issue_descriptions(result, severe=False)) and with_verdict:
         do = "Also" if result.get("verdict") == "unknown" else "Before you use values, also"
         yield f"{do} read the advice below on these issues: {mild}."
@@ -201,7 +201,7 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
     if is_coarse:
         said += " First make the model finer, as follows."
     elif not fit["data_trusted"]:
-        said = "The model does not explain the recordings either: chi2 per degree of freedom is "
+        said = "The model does not explain the recordings: chi2 per degree of freedom is "
         said += f"{fit['chi2_per_dof']:.3g}; noise alone gives 1. First follow the advice above."
     elif near:
         said += f" Also check size and unit of the start values of {names}: near them the recordings hardly depend on "
@@ -238,7 +238,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> tuple[list[str]
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
         said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
-    if cures:
+    if cures and result["fit"]["data_trusted"]:
         said.append(f"For a smaller ±, set {abbreviated_names_text(cures)}, and solve again.")
     return said, cures
 
@@ -327,7 +327,7 @@ def importable_file_contents_lines(contents: FilePreview) -> list[str]:
     for own in contents.sources:
         rate = f"{own.mean_rate:.4g}" if math.isfinite(own.mean_rate) else ""
         kind, _, of = own.imported_as.partition(" ")
-        becomes = f"{kind} {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "not imported"
+        becomes = f"{kind}: {abbreviated_names_text(of.split(', '), math.inf)}" if of else kind or "not imported"
         rows.append((own.name, own.kind, str(own.n_samples), rate, becomes, own.note))
     # rows that only differ in a number
     for group in grouped((tuple(re.sub(r"(?<=\D)\d+", "#", cell) for cell in row), row) for row in rows[1:]).values():

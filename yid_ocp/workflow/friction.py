@@ -88,11 +88,10 @@ def _testable_motion_kinds(run: RunSettings, problem: EstimationProblem) -> dict
     """Return the recordings by kind of motion. Raises `DataError` if they cannot test the friction of the joints."""
     kinds = friction_law_comparison.recording_names_by_name_stem(problem)
     if len(kinds) < 2:
-        allowed = "two recordings or more; with servos, recordings with position commands (motors on)"
-        hint = "list another such motion under recordings.estimate or recordings.held_out"
+        allowed, hint = "two recordings or more", "list a recording of another motion under recordings.estimate"
         unused = [e.name for e in problem.episodes if not any(e.name in own for own in kinds.values())]
         what = f"each motion is held out in turn, which needs two recordings, but only {len(kinds)} can be used"
-        what += f" ({', '.join(unused)}: the motors are off)" if unused else ""
+        what += f" (the motors are off in {', '.join(unused)})" if unused else ""
         raise DataError(what, where=run.setting_location("recordings"), allowed=allowed, hint=hint)
     rubbing, compared = friction_joint_names(run, problem.system), problem.episodes[0].measurements
     if {*rubbing} <= {*problem.system.prescribed} and not any(own.sensor.effort_joints for own in compared):

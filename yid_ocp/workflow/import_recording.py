@@ -60,8 +60,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         write_recording(recording, out)
     issues, is_severe = recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
-    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, with all recordings and the options of the object "
-    then += "(yid-ocp init --help), or list it in CONFIG.yaml: recordings.estimate"
+    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml (name all recordings and the object: yid-ocp init "
+    then += f"--help). If there is a configuration already, add {out} to its recordings.estimate"
     if is_severe:
         then = f"{out} has the values as read: do not use it before the advice above is followed"
     lines = [*issues, *recording_summary_lines(recording), "", *replaced, then]

@@ -74,8 +74,8 @@ def _run_inspect(
         write_text(folder.path / "equations.txt", "\n".join(symbols.text_lines()) + "\n")
         files = () if export is None else export_step_functions(symbols, Path(export), point.theta, step.time_step)
         dependences = _dependence(step, symbols, problem, point)
-        driven, prescribed = step.system.driven, step.system.prescribed
-        roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")
+        moved = {"driven": step.system.driven, "servo": step.system.servos, "prescribed": step.system.prescribed}
+        roles = {joint: role for role, joints in moved.items() for joint in joints}
         at = _columns_at(step, point) if chosen else np.zeros(0)
         result = {
             "format": "yid-inspect/1",

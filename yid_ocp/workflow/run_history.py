@@ -321,9 +321,9 @@ def _have_same_recordings(folders: Sequence[Path]) -> bool:
         lacking += [f"{Path(path).name} only in {folder}" for digest, path in own.items() if digest not in other]
     if lacking:
         what = f"the runs share some recordings but not all: {', '.join(lacking)}"
-        allowed = "two runs of the same recordings (overlaid), or of recordings that do not overlap (a history)"
-        hint = "run one of them again with the other's `recordings`; a file that changed counts as another one"
-        raise ConfigError(what, where="report", allowed=allowed, hint=hint)
+        allowed = "two runs of the same recordings, or runs without a common recording"
+        hint = "run one of them again with the `recordings` of the other"
+        raise ConfigError(what, where="report RUN RUN", allowed=allowed, hint=hint)
     return True
 
 
