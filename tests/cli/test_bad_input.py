@@ -113,7 +113,10 @@ OTHER = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda j: setitem(j.attrs, "names", OTHER), ("joint 'elbow' of the model is not recorded", "mean 'elbo'?", "RECORDED=elbow")),
+        (
+            lambda j: setitem(j.attrs, "names", OTHER),
+            ("joint 'elbow' of the model is not recorded", "mean 'elbo'?", "RECORDED=elbow"),
+        ),
         (lambda j: delitem(j, "effort"), ("no sensor of the model has a measurement", "which has no efforts")),
         (lambda j: delitem(j.attrs, "effort_std"), ("deviation of the noise", "sensors.joints.effort.std")),
     ],

@@ -145,11 +145,11 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said():
     assert "check the stated noise (is the true noise 4 times as large?) and run `yid-ocp diagnose`" in near
     lines = told("yid-solve/1", said)
     # two things: what it does not explain, and which numbers count beyond it, by the ± that the misfit implies
-    sure = "Until then, take these values as rough: a. Their ± takes the model's error as random."
+    sure = "The ± of a takes the model's error as random. Until its cause is known, the values may be wrong."
     assert (" ".join(lines[:2]), lines[2]) == (first, sure)
     for std, data in ((0.21, BAD), (0.1, BAD | {"data_trusted": False})):
         unsure = solved(fit=data, parameters={"a": parameter("not_trusted") | {"std": std}})
-        assert "as rough" not in " ".join(told("yid-solve/1", unsure))
+        assert "as random" not in " ".join(told("yid-solve/1", unsure))
     lost = {"k": parameter("not_identifiable", 1.29e6) | {"initial": 1.3e6}, "b": parameter("not_identifiable")}
     for name, fraction in (("k", 1.0), ("b", 0.1)):
         still = {"cause": "weak_excitation", "setting": f"parameters.{name}.free: false", "where": "", "certainty": ""}
@@ -390,3 +390,7 @@ def test_no_friction_law_is_advised_whose_error_is_far_above_noise(error, verdic
     lines = told("yid-friction/1", result | {"friction_parameters": ["elbow.damping"], "kinds": ["a", "b"]})
     assert words in " ".join(lines)
     assert ("  model:" in lines) == words.startswith("Use the law")
+    law["parameters"]["wrist.damping"] = parameter("not_identifiable")
+    more = {"friction_parameters": ["elbow.damping", "wrist.damping"], "kinds": ["a", "b"]}
+    both = " ".join(told("yid-friction/1", result | more))
+    assert ("Do not use wrist.damping, which" in both) == words.startswith("Use the law")

@@ -118,17 +118,21 @@ def test_joints_and_motion_capture_become_one_recording_by_the_command_of_the_pr
     rows = "".join(f"{x:.3f},{math.sin(3 * x):.6f},{3 * math.cos(3 * x):.6f},{k % 3}\n" for k, x in enumerate(t))
     (odd / "joints.csv").write_text("timestamp,pos_a,vel_a,tau_a [Nm]\n" + rows)
     turned = np.column_stack([t, 500 * np.cos(np.sin(3 * t)), 500 * np.sin(np.sin(3 * t))])
+    turned[7, 1:] = 0.0  # a lost marker
     rows = "".join(f"{x:.3f},{y:.3f},{z:.3f},0\n" for x, y, z in turned)
     (odd / "mocap.csv").write_text("time,tip X,tip Y,tip Z\n" + rows)
     *_, said = printed("import", *BOTH, "--preview").strip().splitlines()
     twice = printed("import", "joints.csv", "joints.csv", "--preview")
     assert "the files are not parts of one recording: " in twice
+    printed("import", *BOTH, "--out", "no.h5", "--columns", "Zeit=t", code=2)
     told = printed(*shlex.split(said)[1:])
     assert "position [rad], velocity [rad/s], effort [N m]" in told
     assert "have one clock" in told
     recording = read_recording(odd / "joints_merged.h5")
     assert recording.joints.names == ("a",)
     assert recording.points[0].position[0, 0] == pytest.approx([0.5, 0, 0])
+    assert np.flatnonzero(np.isnan(recording.points[0].position[:, 0, 0])).tolist() == [7]
+    assert "not measured: 1 position of tip that the file states as 0, 0, 0" in told
     assert all(file_sha256(odd / name) in recording.source for name in BOTH)
     words = ["--units", "mm", "--points", "tip=w_rod", "--joints", "a=elbow", "--columns", "tau_a [Nm]=skip"]
     printed("import", *BOTH, "--out", "both.h5", *words, "--clock-offset", "mocap=0.5")

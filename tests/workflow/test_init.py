@@ -550,6 +550,10 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     write_recording(moved(SHORT), bench / "one.h5")
     assert "the recording lacks the joint 'pitch', which one has" in refusal("one.h5", "bag.csv")
     assert not (bench / "bag.h5").exists()
+    roll = moved(SHORT)
+    roll = replace(roll, joints=JointGroup(("roll",), SHORT, roll.joints.position[:, :1]))
+    write_recording(roll, bench / "roll.h5")
+    assert "the recording lacks the joint 'pitch', which moves in one" in refusal("roll.h5", "one.h5")
     (bench / "run.yaml").write_text("kept: true\n")
     assert "already exists" in refusal("one.h5")
     assert (bench / "run.yaml").read_text() == "kept: true\n"

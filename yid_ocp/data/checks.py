@@ -186,7 +186,7 @@ def _common_clock(recording: Recording, options: SensorOptionsFunction) -> Itera
         ):
             lag, _, option = late_notes[0].partition(LATE_POINTS_WORDS)[2].partition(" (--clock-offset ")
             what = f"{LATE_POINTS_WORDS}{lag.partition(':')[0]}. Their clock is off, or the flexible object lags behind"
-            advice = "run `yid-ocp diagnose`: it tells a late clock (camera_latency) from a lag of the object. A late "
+            advice = "`yid-ocp diagnose` distinguishes a late clock (camera_latency) from a lag of the object. A late "
             advice += "clock makes a damping wrong. If it is the clock, import all files of this clock again, here "
             advice += f"with --clock-offset {option.rstrip(')')}, or let a fit find the offset"
             line = f"sensors.{group.name}.clock_offset_std: {lag.split()[0][1:]}"

@@ -128,7 +128,9 @@ def _read_motive(rows: _Rows, where: str) -> _MocapTable:
     axes, kinds, names = head[-1], by_label.get("Type", []), by_label.get("Name", [])
     quantities = next((row for row in head[1:-1] if "Position" in row), [])
     if axes[:1] != ["Frame"] or len(axes) < 2 or not (kinds and names and quantities):
-        raise _broken(where, "rows Type, Name, Rotation or Position, then Frame, Time (Seconds)")
+        known = {"Type": kinds, "Name": names, "Rotation or Position": quantities}
+        lost = [f"a row {word}" for word, cells in known.items() if not cells]
+        raise _broken(where, " and ".join(lost) or "a row Frame, Time (Seconds) above the numbers")
     columns: dict[str, range] = {}
     for i in range(2, min(len(axes) - 2, len(names))):
         if quantities[i : i + 3] == ["Position"] * 3 and axes[i : i + 3] == ["X", "Y", "Z"] and names[i]:

@@ -422,8 +422,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     elif is_absent:
         text = f"Use no friction law, because these recordings do not show friction of {joints}."
     elif lost:
-        text = f"Do not use the constants of friction yet, because these recordings do not determine {lost}. First "
-        text += f"record motions that do. So far the best law is '{best}': {reason} ({errors})."
+        text += f" Do not use {lost}, which these recordings do not determine."
     yield SummaryStatement(f"{text} Each motion was held out in turn: {kinds}.", "conclusion")
     words = {name: _friction_constant_words(name, fitted[name]["unit"]) for name in friction}
     columns = dict.fromkeys(words.values())  # a prismatic joint has units, and so columns, of its own

@@ -174,7 +174,9 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
         if result.get("format") != "yid-solve/1":  # whose table has the values
             yield "Values to use (± is one standard deviation):"
             yield CodeBlock("\n".join(use["values"]))
-            yield f"Not known to within 10 %, so not listed: {lost}." if lost else ""
+            yield f"Not listed, because they are not known well enough: {lost}." if lost else ""
+            zero = abbreviated_names_text(use.get("near_zero", ()))
+            yield f"Not listed, because they do not differ from zero by more than two ±: {zero}." if zero else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():
@@ -213,7 +215,7 @@ def misfit_summary_blocks(result: Mapping[str, Any], parameters: Mapping[str, An
         limit = uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD
         free = {name: std for name, std in stds.items() if std is not None and not is_at_bound(parameters[name])}
         rough = abbreviated_names_text([name for name, std in free.items() if std <= limit * values[name]])
-        said = f"Until then, take these values as rough: {rough}. Their ± takes the model's error as random."
+        said = f"The ± of {rough} takes the model's error as random. Until its cause is known, the values may be wrong."
         yield SummaryStatement(said if rough else "", "conclusion")
 
 

@@ -268,8 +268,8 @@ def _warn(found: dict[str, Any], what: str, when: str, remedy: str, rows: list[d
         if b > 0 and abs(a - b) / b > _FREQUENCY_TOLERANCE
     ]
     change = f"by more than {100 * _FREQUENCY_TOLERANCE:g} % when {when}"
-    said = f"natural frequencies change {change}: {', '.join(moved)}. Set {remedy}. `solve --set "
-    said += "output.checked_discretisation=both` tests whether the estimates need this"
+    said = f"at the initial values, natural frequencies change {change}: {', '.join(moved)}. Set {remedy}. `solve "
+    said += "--set output.checked_discretisation=both` tests whether the estimates need this"
     found["warnings"] += [said] if moved else []
     fine = f"No natural frequency changes {change}, so {what} fine enough. "
     found["message"] += fine * (not moved and bool(rows[-1]["hertz"]))

@@ -222,7 +222,13 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
     if not whole.joint_names:
         what, hint = "the robot has no joint that can move", "give the URDF or MJCF file of the whole robot"
         raise ConfigError(what, where=robot, allowed="revolute, continuous or prismatic joints", hint=hint)
-    recorded = recordings[0].joint_names
+    recorded, first = recordings[0].joint_names, recordings[0].name
+    for other in recordings[1:]:
+        for name in set(whole.joint_names).intersection(other.joint_names).difference(recorded):
+            if _travel(other, [name]) > _MIN_ARM_TRAVEL:
+                what = f"the recording lacks the joint '{name}', which moves in {other.name}"
+                allowed, hint = "recordings with the same joints", f"leave one of the two out, or record '{name}'"
+                raise ConfigError(what, where=first, allowed=allowed, hint=hint)
     if not (known := [name for name in whole.joint_names if name in recorded]):
         what = f"none of the recorded joints is a joint of the robot: {', '.join(recorded)}"
         hint = "give the URDF or MJCF file of the robot that was recorded. If it is the same robot with other names, "

@@ -71,7 +71,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
 
 def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
     """Print the contents of files, the recordings they would become, and the command that imports them."""
-    found, said = list[dict[str, Any]](), list[str]()
+    found, said, are_importable = list[dict[str, Any]](), list[str](), True
     for file in arguments.files:
         with stderr_progress_display(arguments) as progress:
             progress.begin_stage(f"listing the contents of {file}")
@@ -82,12 +82,13 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
             lines = importable_file_contents_lines(contents)
             if not has_native_recording_suffix(file):
-                lines += _proposal_lines([file], options, progress)
+                lines += (proposal := _proposal_lines([file], options, progress))
+                are_importable &= proposal[-1].startswith("  yid-ocp import")
         said += [*([f"{file}:"] if len(arguments.files) > 1 else []), *lines, ""]
     if len(arguments.files) > 1:
         options = _combined([*(own["options"] for own in found), asked])
         with stderr_progress_display(arguments) as progress:
-            said += _proposal_lines(arguments.files, options, progress)
+            said += _proposal_lines(arguments.files, options, progress, are_importable)
     if arguments.json:
         more = found[0] if len(found) == 1 else {"files": dict(zip(arguments.files, found, strict=True))}
         print_json({"format": _RESULT_FORMAT, "recording": None, **more})
@@ -110,12 +111,17 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return combined
 
 
-def _proposal_lines(files: Sequence[str], options: Mapping[str, Any], progress: Progress) -> list[str]:
-    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing."""
+def _proposal_lines(
+    files: Sequence[str], options: Mapping[str, Any], progress: Progress, are_importable: bool = False
+) -> list[str]:
+    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing.
+
+    Nothing is missing if each of them can be imported alone (`are_importable`).
+    """
     try:
         recording = _read(files, options, progress)
     except DataError as error:
-        if len(files) > 1:
+        if are_importable:
             return ["", f"the files are not parts of one recording: {error.what}"]
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more]
@@ -153,7 +159,7 @@ def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) ->
     if units.get("effort") in base.MOTOR_CURRENT_UNITS:
         late["units"] = {"effort": units.pop("effort")}
     columns, matched, present = options.get("column_meanings") or {}, set[str](), set[str]()
-    parts = []
+    options_by_file = dict[str, Mapping[str, Any]]()
     for file in files:
         own = {name: value for name, value in options.items() if name in known[file] and name not in late}
         own |= {"units": units} if units and "units" in known[file] else {}
@@ -162,10 +168,11 @@ def _read(files: Sequence[str], given: Mapping[str, Any], progress: Progress) ->
             known_here = (key for key in columns if any(map(column_pattern(key).fullmatch, names)))
             own["column_meanings"] = {key: columns[key] for key in known_here}
             matched, present = matched | set(own["column_meanings"]), present.union(names)
-        parts.append(read_third_party_recording(file, own, progress))
+        options_by_file[file] = own
     if missing := set(columns) - matched:
         said = unknown_name_error_arguments(min(missing), sorted(present), "write COLUMN=MEANING for each column")
         raise DataError(f"no file has a column '{min(missing)}'", where="--columns", **said)
+    parts = [read_third_party_recording(file, own, progress) for file, own in options_by_file.items()]
     stems = [Path(file).stem for file in files]
     if len(set(stems)) < len(stems):
         what = f"two files have the name '{max(stems, key=stems.count)}', apart from folder and ending"

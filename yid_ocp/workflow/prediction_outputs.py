@@ -80,15 +80,17 @@ def copyable_estimate_texts(
 ) -> dict[str, Any]:
     """Return texts to copy, with those of the `estimates` that are identifiable. Empty without such a parameter.
 
-    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (other free parameters),
-    `joints` (number of links, range of joint stiffness [N m/rad], by segment and deformation), lines of `yaml` (first
-    `model_yaml`) and `mjcf`, rows of `latex`, `export` (the `command`), `cite`. `theta` (ntheta,) has all parameters.
+    The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (parameters not found),
+    `near_zero` (less than two stds from zero), `joints` (number of links, range of joint stiffness [N m/rad], by
+    segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of `latex`, `export` (the
+    `command`), `cite`. `theta` (ntheta,) has all parameters.
     `values` and `latex` have no offsets of points beside other estimates.
     """
-    found = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
+    sure = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
+    found = {n: e for n, e in sure.items() if abs(e.value) > 2 * e.std}
     if not found:
         return {}
-    unknown = [name for name, own in estimates.items() if own.free and name not in found]
+    unknown = [name for name, own in estimates.items() if own.free and name not in sure]
     terms, springs, joints = _found_joint_terms(system, theta, found, unknown), system.elastic_joints, []
     links = {s.joint_name for s in springs if s.segment_name != s.joint_name}
     turning = [joint.name for joint in system.mechanism.joints if joint.kind == "revolute"]
@@ -119,6 +121,7 @@ def copyable_estimate_texts(
         "values": [f"{n} = {told[n]} {e.unit}".removesuffix(" 1") for n, e in quoted.items()],
         "uncounted_errors": list(uncounted_errors),
         "left_out": unknown,
+        "near_zero": [name for name in sure if name not in found],
         "joints": joints,
         "yaml": [*model_yaml, *["parameters:"] * bool(shared), *starts],
         "mjcf": lines,

@@ -15,6 +15,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import median_sample_period
 from yid_ocp.data.foreign_formats import UNIT_BY_WORD
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validated_recording
+from yid_ocp.display import abbreviated_names_text, count_with_noun
 from yid_ocp.errors import DataError, require_known_names, unknown_name_error_arguments
 from yid_ocp.registry import Registry
 
@@ -156,13 +157,21 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
             hint = "leave them out, or give the columns of currents: --columns COLUMN=effort:JOINT"
             raise DataError(what, where=where, allowed="torque constants and gear ratios with efforts", hint=hint)
         group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
-    seen, chosen = list[PointGroup](), options.point_names
+    seen, chosen, notes = list[PointGroup](), options.point_names, list(raw.notes)
     for entry in raw.points if chosen is None else _chosen_points(raw.points, chosen, where):
         std = None if entry.std is None else factors["points"] * entry.std
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
+        lost = (position == 0).all(axis=2)
+        lost &= ~lost.all(axis=0)
+        if lost.any():  # motion capture systems write zeros for markers that they lost
+            text = abbreviated_names_text([name for name, own in zip(entry.names, lost.T, strict=True) if own.any()])
+            many = count_with_noun(int(lost.sum()), "position")
+            notes.append(f"not measured: {many} of {text} that the file states as 0, 0, 0")
+            position = np.where(lost[:, :, None], np.nan, position)
         seen.append(replace(entry, t=t, position=position, std=std))
     others = tuple(replace(entry, t=factors["t"] * entry.t) for entry in raw.channel_groups)
-    return validated_recording(replace(raw, joints=group, points=tuple(seen), channel_groups=others), where=where)
+    made = replace(raw, joints=group, points=tuple(seen), channel_groups=others, notes=tuple(notes))
+    return validated_recording(made, where=where)
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
