@@ -107,7 +107,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
 
     assert load_config(folder / "config.yaml").solver == load_config(pendulum).solver
     with h5py.File(folder / "trajectories.h5") as file:
-        assert file.attrs["format"] == "yid-trajectories/1"
+        assert file.attrs["format"] == "yid-trajectories/2"
         group = file["recordings/estimate"]
         assert group["q"].shape == (121, 2)
         assert group["joints.effort/predicted"].shape == group["joints.effort/measured"].shape

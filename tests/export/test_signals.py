@@ -138,7 +138,7 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):
     mean, prior = rng.normal(size=(4, 8)), np.array([1.0] * 7 + [0.0])
     seen, before, after = rng.normal(size=(3, 6, 3))
     with h5py.File(run / "trajectories.h5", "w") as file:
-        file.attrs["format"] = "yid-diagnosis-trajectories/1"
+        file.attrs["format"] = "yid-diagnosis-trajectories/2"
         where = file.create_group("where/a")
         where.attrs.update({"unknowns": names, "kinds": kinds, "start": 10.0})
         where["edges"], where["mean"], where["prior"] = 0.5 * np.arange(5), mean, prior

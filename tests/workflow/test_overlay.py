@@ -63,7 +63,7 @@ def test_runs_that_share_only_some_recordings_are_refused_by_name(two_runs, prin
     (alone / "result.json").write_text(json.dumps(copied))
     told = printed("report", first, alone, "--out", tmp_path / "both", code=2)
     assert f"held_out.h5 only in {first}" in told
-    assert "the other's `recordings`" in told
+    assert "the `recordings` of the other" in told
     assert not (tmp_path / "both").exists()
 
 

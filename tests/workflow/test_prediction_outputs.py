@@ -37,7 +37,7 @@ def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
         prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", problem, solution, apart)
     prediction_outputs.write_solve_trajectories(tmp_path / "t.h5", problem, solution, apart)
     with h5py.File(tmp_path / "t.h5") as file:
-        assert file.attrs["format"] == "yid-trajectories/1"
+        assert file.attrs["format"] == "yid-trajectories/2"
         assert list(file["unknowns"].attrs["names"]) == list(solution.unknown_names)
         np.testing.assert_array_equal(file["unknowns/x"], solution.x)
         np.testing.assert_array_equal(file["unknowns/covariance"], solution.covariance)
@@ -70,7 +70,7 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
     finding = SimpleNamespace(smoother_result=None, events=replace(NO_EVENTS, force_estimates=spans))
     prediction_outputs.write_diagnosis_hdf5(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
-        assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
+        assert file.attrs["format"] == "yid-diagnosis-trajectories/2"
         assert list(file) == ["events", "held_out"]
         np.testing.assert_allclose([file["events/run/elbow"][k] for k in ("t", "allowed")], [t, t + 1])
         group = file["held_out/joints.effort"]

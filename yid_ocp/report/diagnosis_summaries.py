@@ -459,7 +459,7 @@ def _history_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         together = "" if entry["drifted"] else value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, shown_unit(entry["unit"]), p, "differs" if entry["drifted"] else ""))
     yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
-    title = "Estimates of each run (± is one standard deviation, without errors of links and time step, which are common)"
+    title = "Estimates of each run (± is one standard deviation, without the common errors of links and time step)"
     yield SummaryTable(rows, title, is_key_table=True)
 
 

@@ -39,7 +39,11 @@ from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
 from yid_ocp.workflow.import_recording import recording_summary_dict
-from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
+from yid_ocp.workflow.prediction_outputs import (
+    DIAGNOSIS_TRAJECTORIES_FORMAT,
+    SOLVE_TRAJECTORIES_FORMAT,
+    trajectories_format,
+)
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
 from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
@@ -350,10 +354,7 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     source, files, notes = folder / "trajectories.h5", [], []
     run_history.read_estimation_result(folder)
     with open_hdf5_after_read_check(source) as file:
-        form = str(file.attrs.get("format", ""))
-        if form not in _PREDICTION_TOPICS:
-            what, hint = f"this version reads no trajectories of the format '{form}'", "run `solve` or `diagnose` again"
-            raise DataError(what, where=str(source), allowed=", ".join(_PREDICTION_TOPICS), hint=hint)
+        form = trajectories_format(file)
         for name, signals in _recordings(file, form).items():
             files.append(Path(out) / f"{name}.mcap")
             notes += _shift_notes(f"{files[-1].name}: ", export_mcap(signals, files[-1]))

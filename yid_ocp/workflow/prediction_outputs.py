@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.display import grouped
+from yid_ocp.errors import DataError
 from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
 from yid_ocp.inference.uncertainty import ParameterEstimate
@@ -174,10 +175,20 @@ def predicted_configuration_trajectory(
     return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)
 
 
-SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
-DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
+SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/2"
+DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/2"
 EpisodeWithNominalAndEffectPredictions = tuple[Episode, EpisodePrediction, EpisodePrediction]
 """A held-out recording, its prediction by the nominal model, and its prediction with the effects."""
+
+
+def trajectories_format(file: h5py.File) -> str:
+    """Return the format of an open trajectories.h5. Raises `DataError` for one that this version does not read."""
+    form = str(file.attrs.get("format", ""))
+    if form not in (SOLVE_TRAJECTORIES_FORMAT, DIAGNOSIS_TRAJECTORIES_FORMAT):
+        allowed = f"{SOLVE_TRAJECTORIES_FORMAT} or {DIAGNOSIS_TRAJECTORIES_FORMAT}"
+        what, hint = f"this version reads no trajectories of the format '{form}'", "run `solve` or `diagnose` again"
+        raise DataError(what, where=str(file.filename), allowed=allowed, hint=hint)
+    return form
 
 
 def write_solve_trajectories(

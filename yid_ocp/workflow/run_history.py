@@ -30,7 +30,7 @@ from yid_ocp.version import package_version
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import CommandOutcome, run_command_and_print
 from yid_ocp.workflow.import_recording import has_native_recording_suffix
-from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT
+from yid_ocp.workflow.prediction_outputs import SOLVE_TRAJECTORIES_FORMAT, trajectories_format
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import (
     existing_input_file,
@@ -388,7 +388,7 @@ def _stored_predictions(folder: Path, roles: dict[str, list[str]]) -> dict[tuple
     """Return predictions in a run's trajectories.h5 by recording and channel. Adds each recording's role to `roles`."""
     found: dict[tuple[str, str], ChannelPrediction] = {}
     with open_hdf5_after_read_check(folder / "trajectories.h5") as file:
-        is_solve = file.attrs["format"] == SOLVE_TRAJECTORIES_FORMAT
+        is_solve = trajectories_format(file) == SOLVE_TRAJECTORIES_FORMAT
         parent = file["recordings"] if is_solve else file
         for name in (name for name in parent if is_solve or name not in ("where", "events")):
             roles.setdefault(name, []).append(str(parent[name].attrs.get("role", "held_out")))
