@@ -221,7 +221,7 @@ def test_check(carried_out, pendulum):
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
-    assert "kinematics of this model and the file double_pendulum.urdf." in " ".join(done.out.split())
+    assert "kinematics for this model and the file double_pendulum.urdf." in " ".join(done.out.split())
 
 
 def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):
