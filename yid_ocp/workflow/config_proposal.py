@@ -224,7 +224,7 @@ def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Rec
         raise ConfigError(what, where=robot, allowed="revolute, continuous or prismatic joints", hint=hint)
     recorded, first = recordings[0].joint_names, recordings[0].name
     for other in recordings[1:]:
-        for name in set(whole.joint_names).intersection(other.joint_names).difference(recorded):
+        for name in (name for name in whole.joint_names if name in other.joint_names and name not in recorded):
             if _travel(other, [name]) > _MIN_ARM_TRAVEL:
                 what = f"the recording lacks the joint '{name}', which moves in {other.name}"
                 allowed, hint = "recordings with the same joints", f"leave one of the two out, or record '{name}'"

@@ -29,6 +29,7 @@ from yid_ocp.export.signals import (
     ros_signals_from_recording,
 )
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
+from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX
 from yid_ocp.model.system import System
 from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.report.terminal import recording_summary_lines, summary_blocks, summary_terminal_lines
@@ -127,7 +128,8 @@ class _CalibratedModel:
         """Return the servo gains that each recording states, by parameter, without those that the settings state."""
         system = build_system(self.settings)
         gains = servo_gain_parameters_by_recording(system, recordings)
-        stated = {n for n, own in settings_by_parameter_name(self.settings, system.parameters).items() if own.initial}
+        chosen = settings_by_parameter_name(self.settings, system.parameters)
+        stated = {name for name, own in chosen.items() if own.initial is not None}
         return [{n: x for n, x in gains.get(r.name, {}).items() if n not in stated} for r in recordings]
 
     def with_values(self, values: Mapping[str, float]) -> _CalibratedModel:
@@ -182,9 +184,10 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         write_text(out, config_yaml_with_defaults(replace(calibrated.settings, parameters=chosen)))
         head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
         return head | {"unknown": unknown, "effects": {}, "parameters": {}, "gate": None}
-    first = (read_recordings_of_role(calibrated.settings, "estimate") if full.servos else [])[:1]
-    gains = calibrated.servo_gains(first)
-    calibrated = calibrated.with_values(dict(*gains))
+    has_firmware_gain = any(n.endswith(JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX) for n in full.parameters.names)
+    recordings = read_recordings_of_role(calibrated.settings, "estimate") if has_firmware_gain else []
+    gains = next(iter(calibrated.servo_gains(recordings[:1])), {})
+    calibrated = calibrated.with_values(gains)
     system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasps = {g.name: _grasp_support(form, supports.get(f"grasp_compliance@{g.name}")) for g in full.grasps}
@@ -204,7 +207,7 @@ def _export_model(folder: Path, out: Path, form: str, is_lossy: bool, progress: 
         "parameters": parameters,
         "unknown": unknown,
         "grasps": {name: vars(entry) for name, entry in grasps.items()},
-        "gain_of": first[0].name if any(gains) else None,
+        "gain_of": recordings[0].name if gains else None,
         "gate": None,
         "versions": software_and_plugin_versions(),
     }

@@ -82,13 +82,13 @@ def _preview(arguments: argparse.Namespace, asked: Mapping[str, Any]) -> int:
             found.append({"sources": sources, "options": contents.reader_options, "notes": contents.notes})
             lines = importable_file_contents_lines(contents)
             if not has_native_recording_suffix(file):
-                lines += (proposal := _proposal_lines([file], options, progress))
-                are_importable &= proposal[-1].startswith("  yid-ocp import")
+                proposal, is_importable = _proposal_lines([file], options, progress)
+                lines, are_importable = lines + proposal, are_importable and is_importable
         said += [*([f"{file}:"] if len(arguments.files) > 1 else []), *lines, ""]
     if len(arguments.files) > 1:
         options = _combined([*(own["options"] for own in found), asked])
         with stderr_progress_display(arguments) as progress:
-            said += _proposal_lines(arguments.files, options, progress, are_importable)
+            said += _proposal_lines(arguments.files, options, progress, are_importable)[0]
     if arguments.json:
         more = found[0] if len(found) == 1 else {"files": dict(zip(arguments.files, found, strict=True))}
         print_json({"format": _RESULT_FORMAT, "recording": None, **more})
@@ -113,20 +113,21 @@ def _combined(proposals: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _proposal_lines(
     files: Sequence[str], options: Mapping[str, Any], progress: Progress, are_importable: bool = False
-) -> list[str]:
-    """Return lines with a command that imports the files (after a trial) and issues found, or with what is missing.
+) -> tuple[list[str], bool]:
+    """Return lines with a command that imports the files and issues found, and True; or what is missing, and False.
 
-    Nothing is missing if each of them can be imported alone (`are_importable`).
+    Nothing is missing if each of the files can be imported alone (`are_importable`).
     """
     try:
         recording = _read(files, options, progress)
     except DataError as error:
         if are_importable:
-            return ["", f"the files are not parts of one recording: {error.what}"]
+            return ["", f"the files are not parts of one recording: {error.what}"], False
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
-        return ["", f"the import needs more information: {error.what}", *more]
+        return ["", f"the import needs more information: {error.what}", *more], False
     what = "it" if len(files) == 1 else "them as one recording"
-    return ["", *recording_issue_lines(recording)[0], f"to import {what}:", f"  {_import_command_line(files, options)}"]
+    issues, command = recording_issue_lines(recording)[0], _import_command_line(files, options)
+    return ["", *issues, f"to import {what}:", f"  {command}"], True
 
 
 def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[list[str], bool]:
