@@ -323,8 +323,7 @@ def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bo
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if joints.effort is None and not seen and has_object:
         hint = "import points too; `yid-ocp import FILE --preview` lists the signals of a file"
-        allowed = "points on the object, or efforts of the joints that move it"
-        what = "the recording has no measurement of the object"
+        what, allowed = "the recording has no measurement of the object", "points on it, or efforts of the joints"
         raise ConfigError(what, where=f"recording '{recording.name}'", allowed=allowed, hint=hint)
     if is_servo:
         return "servo", "no efforts were recorded, but commanded positions, which the arm's servos follow"
