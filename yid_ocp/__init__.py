@@ -72,7 +72,7 @@ def __getattr__(name: str) -> Any:
         return import_module(f"{__name__}.version").package_version()
     if name in _MODULE_OF:
         return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    what = f"module '{__name__}' has no attribute '{name}', but {', '.join(sorted(_MODULE_OF))}"
+    what = f"module '{__name__}' has no attribute '{name}'. It has {', '.join(sorted(_MODULE_OF))}"
     raise AttributeError(what, name=name, obj=import_module(__name__))  # for the nearest name in a traceback
 
 
