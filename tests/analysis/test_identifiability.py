@@ -335,6 +335,7 @@ def test_intervals_are_worked_out_where_they_are_wanted_about_the_best_fit():
     found = info.profiles["a"]
     assert found.values[np.argmin(found.delta_chi2)] == pytest.approx(2.0, abs=1e-3)
     assert set(identifiability(problem, intervals="all").profiles) == {"a", "b"}
+    assert set(identifiability(problem, intervals="a").profiles) == {"a"}
 
 
 def test_an_open_interval_lowers_the_verdict():

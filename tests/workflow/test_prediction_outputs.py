@@ -294,10 +294,8 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
     assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
     ignored, stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
-    assert ("leaves out the error of the time step." in ignored, "not known well enough: T1.twist." in lacking) == (
-        True,
-        True,
-    )
+    assert "leaves out the error of the time step." in ignored
+    assert "not known well enough: T1.twist." in lacking
     zero = {"T3.bend": (0.01, 0.2, "N m/rad", "identifiable")}
     blocks = [*copyable_estimates_blocks({"to_use": copied(system, {"T1.bend": 22.0}, **found, **zero)})]
     assert "do not differ from zero by more than two ±: T3.bend." in " ".join(b for b in blocks if isinstance(b, str))

@@ -138,7 +138,8 @@ def identifiability(
         Parameters for which a profile-likelihood interval is computed.
     """
     names = uncertainty.parameter_unknown_names(problem)
-    wanted = names if intervals == "all" else (intervals,) if isinstance(intervals, str) else tuple(intervals)
+    chosen = (intervals,) if isinstance(intervals, str) else tuple(intervals)
+    wanted = names if intervals == "all" else chosen
     require_known_names(wanted, names, "free parameter", "intervals", ConfigError)
     given = unknown_vector_from_solution(problem, solution)
     wide = with_free_starts_and_grasps(problem, start, grasp_std)

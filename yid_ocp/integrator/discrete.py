@@ -120,7 +120,7 @@ class DiscreteEquations:
 
     @property
     def force_with_derivatives_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses (n, 1) [N m s] of `force_with_derivatives` in `momentum_balance` and `p1`. None if there is none."""
+        """Impulses (n, 1) [N m s] of `force_with_derivatives` in `momentum_balance` and `p1`, or None without it."""
         if self.force_with_derivatives is None:
             return None
         force, (left, right) = self.force_with_derivatives.force, self.force_with_derivatives_shares

@@ -499,19 +499,21 @@ def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     first, second = result["runs"]
     rows: TableRows = [("parameter", first, second, "difference", "difference / larger std", "unit")]
-    differing, compared = list[str](), list[str]()
+    differing, n_compared = list[str](), 0
     for name, entry in result["parameters"].items():
         apart, over = entry["difference"], entry["difference_in_std"]
         cells = [_overlaid_value(entry["values"].get(run)) for run in (first, second)]
         cells += ["" if size is None else f"{size:+.{digits}g}" for size, digits in ((apart, 3), (over, 2))]
         rows.append((name, *cells, shown_unit(entry["unit"])))
-        compared += [] if over is None else [name]
+        n_compared += over is not None
         differing += [name] if over is not None and abs(over) > _MAX_RUN_DIFFERENCE else []
     differ = f"by more than {_MAX_RUN_DIFFERENCE} standard deviations"
-    names = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
-    none = f"The two runs agree: no parameter differs {differ}."
-    none = none if compared else "No parameter can be compared, because none has a usable value in both runs."
-    yield SummaryStatement(names if differing else none, "verdict")
+    text = f"The two runs agree: no parameter differs {differ}."
+    if not n_compared:
+        text = "No parameter can be compared, because none has a usable value in both runs."
+    elif differing:
+        text = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
+    yield SummaryStatement(text, "verdict")
     yield f"The model did not explain the recordings of {', '.join(poor)}." if (poor := result.get("poor")) else ""
     said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
     yield f"The models differ (model.{section}), {said}." if (section := result.get("model_difference")) else ""

@@ -56,6 +56,16 @@ _MOTION_PARAMETER_WORDS = ("damping", "viscous", "coulomb", "stribeck", "inertia
 """Words in the names of parameters that are unobservable at rest."""
 
 
+def servo_gains_by_recording(
+    run: RunSettings, system: System, recordings: Sequence[Recording]
+) -> dict[str, dict[str, float]]:
+    """Return the servo gains that recordings state, by recording and parameter, without those that settings state."""
+    chosen = build.settings_by_parameter_name(run, system.parameters)
+    stated = {name for name, own in chosen.items() if own.initial is not None}
+    found = servo_gain_parameters_by_recording(system, recordings)
+    return {recording: {n: x for n, x in own.items() if n not in stated} for recording, own in found.items()}
+
+
 def make_problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
     """Make the options of the estimation problem that a run's settings describe.
 
@@ -74,10 +84,8 @@ def make_problem_options(run: RunSettings, system: System, recordings: Sequence[
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = cable_vertices_between_clamps(run)
     own = build.marker_position_values_by_recording(run, system, recordings)
-    for name, factors in servo_gain_parameters_by_recording(system, recordings).items():
-        # gains in the settings take precedence over recorded ones
-        unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
-        own[name] = own.get(name, {}) | unsaid
+    for name, factors in servo_gains_by_recording(run, system, recordings).items():
+        own[name] = own.get(name, {}) | factors
     clamps: tuple[ClampPosePointNames, ...] = ()
     item, checked = run.model.object, run.output.checked_discretisation
     if checked is None:

@@ -19,6 +19,7 @@ from yid_ocp.data.channel_checks import QUALITY_LIMITS, median_sample_period
 from yid_ocp.display import Progress, abbreviated_names_text, count_with_noun
 from yid_ocp.files import check_input_file
 from yid_ocp.integrator.step import Step
+from yid_ocp.model.objects.base import MATERIAL_DENSITIES
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
@@ -51,8 +52,9 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
         warnings: list[str] = []
         progress.begin_stage("building the model")
         step, item = build_step(run), run.model.object
-        dense = "" if item is None else item.implausible_density_text
-        warnings += [f"{dense}, but materials have 5 to 20000. Correct its mass [kg] or sizes [m]"] if dense else []
+        if item is not None and (text := item.implausible_density_text):
+            known = "{:g} to {:g}".format(*MATERIAL_DENSITIES)
+            warnings.append(f"{text}, but materials have {known}. Correct its mass [kg] or sizes [m]")
         recordings, problem = [], None
         if run.recordings.estimate:
             progress.begin_stage("placing the recordings on the model")

@@ -31,13 +31,13 @@ from yid_ocp.export.signals import (
 from yid_ocp.files import attributes_to_dict, file_sha256, to_json_types, write_strict_json, write_text
 from yid_ocp.model.servos_and_springs import JOINT_SERVO_GAIN_FACTOR_PARAMETER_SUFFIX
 from yid_ocp.model.system import System
-from yid_ocp.problem.recorded_inputs import servo_gain_parameters_by_recording
 from yid_ocp.report.terminal import recording_summary_lines, summary_blocks, summary_terminal_lines
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.virtual.mjcf import import_mujoco, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import ReplayErrorAgainstRecording, replay_mismatch_by_channel
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
+from yid_ocp.workflow.build_problem import servo_gains_by_recording
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
 from yid_ocp.workflow.import_recording import recording_summary_dict
 from yid_ocp.workflow.prediction_outputs import (
@@ -126,11 +126,8 @@ class _CalibratedModel:
 
     def servo_gains(self, recordings: Sequence[Recording]) -> list[dict[str, float]]:
         """Return the servo gains that each recording states, by parameter, without those that the settings state."""
-        system = build_system(self.settings)
-        gains = servo_gain_parameters_by_recording(system, recordings)
-        chosen = settings_by_parameter_name(self.settings, system.parameters)
-        stated = {name for name, own in chosen.items() if own.initial is not None}
-        return [{n: x for n, x in gains.get(r.name, {}).items() if n not in stated} for r in recordings]
+        gains = servo_gains_by_recording(self.settings, build_system(self.settings), recordings)
+        return [gains.get(recording.name, {}) for recording in recordings]
 
     def with_values(self, values: Mapping[str, float]) -> _CalibratedModel:
         """Return the model with some other parameter values."""

@@ -22,7 +22,12 @@ from yid_ocp.data.readers import READERS
 from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, OutputError, nearest_name_question, unknown_name_error_arguments
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitialObjectSettings, object_factories_for_init, parse_comma_separated_numbers
+from yid_ocp.model.objects.base import (
+    MATERIAL_DENSITIES,
+    InitialObjectSettings,
+    object_factories_for_init,
+    parse_comma_separated_numbers,
+)
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import class_options_by_key
@@ -128,7 +133,8 @@ def _object_from_arguments(arguments: argparse.Namespace) -> InitialObjectSettin
         raise ConfigError(what, where="--branch", allowed="--branch with --object tree", hint=hint)
     item = template.build({name: value for name, value in given.items() if value}, links)
     if what := item.settings.implausible_density_text:
-        allowed, hint = "5 (foam) to 20000 kg/m^3 (tungsten)", "give the mass in kg, and lengths and radii in m"
+        allowed = "{:g} (foam) to {:g} kg/m^3 (tungsten)".format(*MATERIAL_DENSITIES)
+        hint = "give the mass in kg, and lengths and radii in m"
         raise ConfigError(what, where="--mass, --length, --radius", allowed=allowed, hint=hint)
     return item
 

@@ -199,6 +199,9 @@ def initial_parameters_with_comments(
     return found
 
 
+MATERIAL_DENSITIES = 5.0, 20_000.0  # of foam and of tungsten [kg/m^3]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ObjectBuilder:
     """The base class of all kinds of flexible objects in `OBJECT_KINDS`. Its fields are the object's settings.
@@ -253,11 +256,11 @@ class ObjectBuilder:
 
     @property
     def implausible_density_text(self) -> str:
-        """A sentence part with the name and the density of a segment that no material has; empty if there is none."""
+        """The name and the density of a segment, as text, if no material is as light or as heavy. Otherwise empty."""
         for own in self.segment_definitions():
             width, height = own.cross_section_size or (math.sqrt(math.pi) * (own.radius or math.nan),) * 2
             density = own.mass / (own.length * width * height)
-            if density < 5 or density > 20_000:
+            if not MATERIAL_DENSITIES[0] <= density <= MATERIAL_DENSITIES[1]:
                 return f"'{own.name}' has the density {density:.2g} kg/m^3"
         return ""
 
