@@ -247,7 +247,7 @@ def test_a_common_change_names_the_largest_part_first_and_leaves_small_ones_out(
         return [-50 * (0.3 * a + 0.95 * b + 0.01 * c), 20 * (0.95 * a - 0.3 * b), 30 * c]
 
     last = identifiability(Formula(rows, dict.fromkeys("abc", 2.0))).directions[-1]
-    assert last.words.startswith("a change of b by +10 % and a by +3.2 % is determined (± 2 %)")
+    assert last.words == "b and a are determined together: one standard deviation changes them by +1.9 % and +0.6 %"
     assert last.components["b"] > 0.9
 
 

@@ -157,6 +157,8 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
+    beyond = replace(known, values=np.array([-1e-18]))  # rounding, where a run ended at its bound
+    assert problem_with_priors_and_baseline(problem, beyond)[0].theta[problem.system.parameters.index("beam.bend")] == 0
     together, baseline = problem_with_priors_and_baseline(problem, known)
     both = refit_with_effects(RefitContext(AllCandidatesProblem(together, (), False)), (), {})
     [shift] = baseline.parameter_shifts_of_fit(both, Thresholds()).parameter_shifts

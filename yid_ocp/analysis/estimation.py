@@ -58,6 +58,9 @@ def solve(
     callback : callable, optional
         Receives every `Iterate`.
     """
+    if not isinstance(problem, EstimationProblem):
+        what, hint = f"the problem is {problem!r}", "build it with yid_ocp.load_problem(CONFIG.yaml)"
+        raise ConfigError(what, where="problem", allowed="an EstimationProblem", hint=hint)
     if isinstance(solver, str):
         what, allowed = f"the solver is the text '{solver}'", "a solver object, such as yid_ocp.GaussNewton()"
         raise ConfigError(what, where="solver", allowed=allowed, hint="leave it out for Gauss-Newton")

@@ -367,7 +367,7 @@ def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
 def _unseen_direction(view: _Sensitivities, vector: Array) -> _ParameterDirection:
     parts = _components(view, vector)
     if float(np.linalg.norm(view.by_alone @ vector)) * uncertainty.MAX_WEAK_RELATIVE_STD >= 1.0:
-        change = ("a change of " if len(parts) == 1 else "") + _change_words(parts)
+        change = _change_words(parts)
         cause = _hiding_nuisances(view, vector)
         made = _direction(view, vector, f"these recordings cannot distinguish {change} from {cause}")
         return replace(made, hidden_change=change, hidden_by=cause)
@@ -411,16 +411,19 @@ def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) ->
     parts = [part for part in parts if abs(part.coefficient) > _MIN_NAMED_SHARE * abs(parts[0].coefficient)]
     own = float(std[view.names.index(parts[0].name)])
     spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
-    how = "is determined" if spread <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD else "is determined only weakly"
-    order = "" if len(parts) > 1 or math.isfinite(own) else " to first order"
-    return f"{_change_words(parts)} {how} (± {uncertainty.percent_number_text(spread)} %{order})"
+    rough = "" if spread <= uncertainty.MAX_IDENTIFIABLE_RELATIVE_STD else " only weakly"
+    if len(parts) > 1:
+        sign = math.copysign(100 * spread, parts[0].coefficient)
+        changes = _joined([f"{sign * part.coefficient:+.2g} %" for part in parts])
+        names = _joined([part.name for part in parts])
+        return f"{names} are determined{rough} together: one standard deviation changes them by {changes}"
+    order = "" if math.isfinite(own) else " to first order"
+    return f"{parts[0].name} is determined{rough} (± {uncertainty.percent_number_text(spread)} %{order})"
 
 
 def _change_words(parts: Sequence[_Component]) -> str:
-    if len(parts) == 1:
-        return parts[0].name
     changes = [f"{part.name} by {10 * part.coefficient / parts[0].coefficient:+.2g} %" for part in parts]
-    return f"a change of {_joined(changes)}"
+    return f"a change of {parts[0].name if len(parts) == 1 else _joined(changes)}"
 
 
 def _combination_words(parts: Sequence[_Component]) -> str:

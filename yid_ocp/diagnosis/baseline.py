@@ -120,7 +120,9 @@ def _add_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
             hint = f"set {where}: false, or diagnose without a baseline (--baseline, baseline)"
             raise ConfigError(what, where=where, allowed="false, or no baseline with this parameter", hint=hint)
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
-    values |= dict(zip(names, map(float, baseline.values), strict=True))
+    # a mean of runs, and rounding, can lie beyond a bound at which a run ended
+    bounds = np.array([[parameters[name].lower, parameters[name].upper] for name in names]).reshape(-1, 2).T
+    values |= dict(zip(names, map(float, np.clip(baseline.values, *bounds)), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
     stds = {name: std for name, std in problem.options.prior_stds.items() if name not in names}
     options = replace(problem.options, prior_stds=stds, multivariate_prior=prior)

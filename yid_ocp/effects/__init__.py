@@ -37,7 +37,8 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     places = cls.possible_locations(system)
     # a payload or point mass may be at any frame, including frames of the arm that are not in `system.point_frames`
     if location not in places and not (cls.is_at_point_groups and location.partition("_")[0] == "points"):
-        said = {"allowed": "no location of this model", "hint": "remove the effect from model.effects"}
+        said = {"allowed": "no location of this model, which has nothing on which the effect acts"}
+        said |= {"hint": "remove the effect from model.effects, or set another model.arms.mode"}
         said = unknown_name_error_arguments(location, places) if places else said
         raise ModelError(f"the effect {kind} is not possible at '{location}'", where=label, **said)
     definitions = cls.parameter_definitions(location, system)

@@ -39,7 +39,7 @@ class Parameter:
             allowed = f"{'at least' if is_low else 'at most'} {bound:g} {self.unit}"
             what = f"{self.name} = {self.value:g} {self.unit} lies {side} bound of {bound:g} {self.unit}"
             where = f"parameters.{self.name}"
-            hint = f"change {where}.initial, or `bounds` if you set them"
+            hint = f"change {where}.initial, or set wider {where}.bounds"
             raise ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 

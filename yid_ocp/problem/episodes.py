@@ -353,6 +353,10 @@ def _samples(
         if options.weighting == "paper":
             what = "steepest_descent and weighting: paper compare points or efforts only, and the recording has none"
         hint = "record efforts or points; if the file has some, set use: true or frame_by_recorded_name under `sensors`"
+        if found and not lost:
+            what = f"no reading of the recording can be used in {grid.node_times[-1] - grid.node_times[0]:.3g} s: all "
+            what += "are missing, of joints at rest, or nearer to an end than the filter of problem.path_cutoff reaches"
+            hint = "set a longer problem.duration, or use another recording"
         raise DataError(what, where=where, allowed="points on the model's frames, or channels of its joints", hint=hint)
     return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
 

@@ -282,7 +282,7 @@ def _batch_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (SummaryStatement(text, "verdict") for text in said)
     rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(rows, "Fit of each run (± is one standard deviation)", is_key_table=True, links=links)
-    spread: TableRows = [("parameter", "runs that found it", "smallest", "median", "largest", "unit")]
+    spread: TableRows = [("parameter", "runs with an estimate", "smallest", "median", "largest", "unit")]
     for (name, unit), values in found.items():
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))

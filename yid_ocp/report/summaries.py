@@ -98,6 +98,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         interval = _interval_cell(entry, entry["std"]) if converged else ""
         value = "–" if verdict == "not_identifiable" or std == "infinite" else value
         said = VERDICT_TABLE_TEXTS[verdict] if converged else ""
+        is_near_zero = verdict == "identifiable" and entry["std"] > 0.1 * abs(entry["value"])
+        said += " (near zero)" * (converged and is_near_zero)
         more = (shown_unit(entry["unit"]), said, bound_range_text(entry, 4), entry.get("meaning", ""))
         rows.append((name, value, std, interval, *more))
     is_useless = not (converged or is_trusted)
@@ -119,7 +121,8 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield result.get("safeguard", "")
     steps = count_with_noun(result["iterations"], "iteration") + " in all starts" * (status == "iteration_limit")
     yield next_steps_table(result, _steps_after_solve(result, free))
-    yield f"End of the fit: {status.replace('_', ' ')} after {steps} ({result['seconds']:.1f} s of search)."
+    ended = "the search converged" if converged else status.replace("_", " ")
+    yield f"End of the fit: {ended} after {steps} ({result['seconds']:.1f} s)."
 
 
 def _steps_after_solve(result: Mapping[str, Any], free: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -201,7 +204,8 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     yield from (f"The held-out recording '{name}' could not be predicted, because {why}.{do}" for name, why in failed)
     yield SummaryTable(rows, "Errors (rms) on held-out recordings, which the fit does not use")
     known = [(e["rmse"].get(c), x) for e in result["held_out"] for c, x in e.get("expected", {}).items()]
-    said = "No error exceeds twice that of noise alone, so the model predicts them well."
+    said = "No error exceeds twice that of noise alone"
+    said += ", so the model predicts them well." if result["status"] == "converged" else "."
     if not result["fit"]["explains"] or any(error > MAX_NOISE_RATIO * x for error, x in known if error and x):
         said = "An error above twice that of noise alone shows an error of the model"
         said += "." if result["status"] == "converged" else ", or of values whose search has not ended."
@@ -340,7 +344,11 @@ def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIte
     yield SummaryStatement(said if only_known else "", "verdict")
     flags = " --unknown-grasp" * (result.get("grasp_std") is not None)
     flags += " --unknown-start" * (result.get("start") == "unknown")
-    steps = {"fit, for estimates with intervals": f"identifiability{flags}"} if is_initial and (found or weak) else {}
+    steps = (
+        {"fit first, and judge at the fit (without --initial)": f"identifiability{flags}"}
+        if is_initial and (found or weak)
+        else {}
+    )
     steps |= {"find the cause of the model's error": "diagnose"} if is_poor and result["fit"]["data_trusted"] else {}
     more = {"compute exact intervals, which may be asymmetric": f"identifiability --intervals all{flags}"}
     steps |= {} if is_initial or result["profiles"] else more
@@ -495,7 +503,9 @@ def _check_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if severe:
         ended = f"Do not run `solve` yet, because its values would be unusable: {severe}. Follow the advice below."
     elif is_advised:
-        ended = f"`solve` can run, but values may be wrong. First read the {'issues' if mild else 'warnings'} below."
+        ended = (
+            f"`solve` can run, but may fail or give wrong values. Read the {'issues' if mild else 'warnings'} below."
+        )
     elif coarse:
         ended = "`solve` can run. The simulation may be too coarse (warnings below)."
     ended += " Because of `--strict`, they end `check` with exit code 2." * bool(result.get("refused"))

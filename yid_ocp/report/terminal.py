@@ -240,7 +240,7 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> tuple[list[str]
             quiet.append(words)
     if quiet and result["fit"]["explains"]:
         said.append(f"Checked: {' or '.join(quiet)} would change no estimate by more than its ±.")
-    if cures and result["fit"]["data_trusted"]:
+    if cures and result["fit"]["data_trusted"] and result["fit"]["explains"]:
         said.append(f"For a smaller ±, set {abbreviated_names_text(cures)}, and solve again.")
     return said, cures
 
@@ -296,7 +296,8 @@ def summary_terminal_lines(blocks: Sequence[StatementTableOrCode]) -> list[str]:
 
 def absent_parameters_sentence(free: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a sentence on estimates that ended at 0, the smallest possible value. Empty if there are none."""
-    names = abbreviated_names_text([n for n, e in free.items() if is_at_bound(e, ("lower",)) and e["lower"] == 0])
+    told = [n for n, e in free.items() if is_at_bound(e, ("lower",)) and e["verdict"] != "not_identifiable"]
+    names = abbreviated_names_text([name for name in told if free[name]["lower"] == 0])
     do = "Fix it there (parameters.NAME.free: false) if it is absent, else run `yid-ocp diagnose`."
     return f"The recordings show nothing of what ended at 0, its smallest value: {names}. {do}" if names else ""
 

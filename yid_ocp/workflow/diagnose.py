@@ -120,12 +120,13 @@ def run_diagnose(
         x, is_found = last.unknowns, finding.verdict in ("effect", "no_gap")
         is_found = is_found and problem.options.has_no_data_issue_above_warning
         recordings = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
+        tries_all = isinstance(run.diagnosis.candidates, str)
         own = {
             "model": _final_model_to_dict(finding),
             "issues": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": prediction_outputs.torque_offsets_by_recording(last.problem, x),
             "to_use": _texts_of_final_model(finding, os.path.relpath(folder.final_path)) if is_found else {},
-            "not_candidates": effect_kinds_by_missing_signals(recordings),
+            "not_candidates": effect_kinds_by_missing_signals(recordings) if tries_all else {},
             "unused_efforts": prediction_outputs.has_unused_efforts(problem),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), str(folder.final_path)),
         }

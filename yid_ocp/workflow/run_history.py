@@ -127,8 +127,9 @@ def read_estimation_result(
 def read_result_file(file: Path) -> dict[str, Any]:
     """Read the result.json of any command. Raises `DataError` if it cannot be read."""
     if not is_file(file):
-        hint = "give the run folder that `solve` or `diagnose` printed"
-        what = f"{file.parent} {'has no finished run' if file.parent.is_dir() else 'is not an existing folder'}"
+        hint = "give the folder of one run, as `solve` or `diagnose` printed it, such as runs/NAME"
+        lack = "is not the folder of a finished run" if file.parent.is_dir() else "is not an existing folder"
+        what = f"{file.parent} {lack}"
         raise DataError(what, where=str(file), allowed="a run folder with result.json", hint=hint)
     result = read_input_json(file)
     if not isinstance(result, dict):

@@ -75,10 +75,10 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
     from yid_ocp.virtual.experiment import VirtualExperimentSettings, run_virtual_experiment
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
-    if run.model.robot is None:
-        allowed = "a recording with initial state, motion of the clamps and sample times"
-        hint = "list a recording, or set model.robot for a virtual experiment"
-        what = "the model has no robot, and no recording drives it"
+    if not system.driven:
+        allowed = "a recording with initial state, motion of prescribed joints or clamps, and sample times"
+        hint = "list a recording, or set model.robot and model.arms.mode: driven for a virtual experiment"
+        what = "no recording drives the model, and it has no driven joints"
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint=hint)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
