@@ -99,7 +99,7 @@ def test_points_of_a_cable_may_be_in_groups_with_their_own_times(tmp_path):
 
 def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
     run = settings(tmp_path, None, ("recordings.estimate=[]", "model.frames={}"))
-    with pytest.raises(ConfigError, match="no robot, and no recording drives it"):
+    with pytest.raises(ConfigError, match="no recording drives the model, and it has no driven joints"):
         run_simulate(run, tmp_path / "made")
 
 

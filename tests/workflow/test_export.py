@@ -203,7 +203,7 @@ def test_wrong_input_leaves_nothing(printed, found, pendulum_data, tmp_path) -> 
         ((recording, "--format", "mjcf"), ["the format mjcf needs a run folder", "solve"]),
         ((recording, "--out", tmp_path / "a.urdf"), ["the format urdf needs a run folder"]),
         ((broken,), ["result.json", "not valid JSON"]),
-        ((tmp_path,), ["no finished run"]),
+        ((tmp_path,), ["is not the folder of a finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),
         ((found, "--lossy", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),
     ):
