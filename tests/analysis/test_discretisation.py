@@ -27,6 +27,7 @@ from yid_ocp.analysis.discretisation import (
 from yid_ocp.analysis.estimation import add_intervals_and_checks
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import NULL_PROGRESS
+from yid_ocp.inference import null_test
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
@@ -481,7 +482,16 @@ def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder,
     group, arm = PointGroup("points", ("tip",), t, seen, 1e-3), JointGroup(["shoulder"], t, angles, position_std=noise)
     recording = Recording(arm, (group,), name="rod")
     given = EstimationProblem(step, [recording], ("elbow.damping",), ProblemOptions(path_cutoff=40.0))
-    found = add_intervals_and_checks(given, fit_problem(given, GaussNewton()))
+    fit = fit_problem(given, GaussNewton())
+    if noise == 2e-3:  # damping that is too large would hide how far the noise moves the rod
+        less, residual = null_test.unknowns_without_encoder_noise_bias(given, fit.x), fit.evaluation.residual
+        assert 0.0 < less[0] - 0.02 < 0.5 * (fit.x[0] - 0.02)
+        biased = null_test.encoder_noise_residual_covariance_factor(given, fit.x)
+        hidden = null_test.whiten_with_drawn_errors(residual, biased[:, :0], biased)
+        assert np.linalg.norm(null_test.whiten_with_encoder_noise(given, fit.x, residual)) < 0.998 * np.linalg.norm(
+            hidden
+        )
+    found = add_intervals_and_checks(given, fit)
     entry, data_std = found.parameters["elbow.damping"], found.checks.data_std["elbow.damping"]
     shift = found.checks.discretisation_shifts["elbow.damping"].encoder_noise
     assert (abs(entry.value - 0.02) > 5 * data_std) == (abs(shift) > data_std) == moved

@@ -18,7 +18,11 @@ from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import YidError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
-from yid_ocp.inference.null_test import episodes_with_noisier_motion, excess_over_sample_count
+from yid_ocp.inference.null_test import (
+    EXTRAPOLATION_FACTOR,
+    excess_over_sample_count,
+    unknown_shifts_by_more_encoder_noise,
+)
 from yid_ocp.inference.uncertainty import EstimateShiftByDiscretisation, ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_with_whitening_at
 from yid_ocp.integrator.step import Step, simulate, step_with_time_step
@@ -34,10 +38,7 @@ from yid_ocp.solvers import GaussNewton
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_UNKNOWN_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
-EXTRAPOLATION_FACTOR = 2.0
-"""Distance to many links, short steps or no encoder noise, over the shift of one refinement: m + m/2 + m/4 + ..."""
 _LEFT_AFTER_CORRECTION = 1 - 1 / EXTRAPOLATION_FACTOR  # of this distance, in data corrected by one refinement
-_N_NOISE_DRAWS = 6  # of encoder noise
 _MAX_TIME_STEP, _MAX_HALVINGS, _MAX_STEP_ERROR_FRACTION = 0.02, 5, 0.03
 _MAX_FINER_FIT_ITERATIONS = 3
 # changes by a finer model in units of r'r, up to which a linear step suffices, and up to which it rules out a decrease
@@ -103,13 +104,13 @@ def _fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tupl
 
 
 def _gauss_newton_step_in_finer_model(
-    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation, has_other_motion: bool = False
+    refined: _FinerModel, coarse: EstimationProblem, x: Array, at_x: Evaluation
 ) -> tuple[dict[str, float], Array, Evaluation] | str:
     """Make one Gauss-Newton step in a finer model, from the coarse unknowns x (nx,).
 
     Returns the shift of each shared free parameter, the linearised residual after the step and the fine evaluation, or
-    a message if the step fails. `at_x` is the coarse evaluation at `x`. With process noise, or the same links, samples
-    and prescribed motion, Jacobian and priors are coarse.
+    a message if the step fails. `at_x` is the coarse evaluation at `x`. With process noise, or the same links and
+    samples, Jacobian and priors are coarse.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -118,8 +119,7 @@ def _gauss_newton_step_in_finer_model(
     own, other = problem.residual_rows, coarse.residual_rows
     if weighted and own.measurements != other.measurements:
         return "the finer model would use other samples of the recordings"
-    is_refined = refined.subdivided_joints or has_other_motion
-    is_alike = weighted or (not is_refined and own.measurements == other.measurements)
+    is_alike = weighted or (not refined.subdivided_joints and own.measurements == other.measurements)
     evaluation = problem.evaluate(point, derivatives=not is_alike, equilibrium_guesses=warm)
     residual, jacobian = evaluation.residual, evaluation.jacobian
     if not evaluation.ok:
@@ -193,7 +193,7 @@ def stds_with_discretisation_and_encoder_errors(
     refinements: dict[RefinementKind, Callable[[], _FinerModel]] = {"time_step": lambda: _FinerModel(fine)}
     if "links" in coarse.options.checked_discretisations and _has_divisible_links(coarse):
         refinements["links"] = lambda: _refined_problem(coarse, "links", effects=effects)
-    shifts, counted = [_shifts_by_more_encoder_noise(coarse, x, at_x)], list[RefinementKind]()
+    shifts, counted = [_shifts_by_more_encoder_noise(coarse, x)], list[RefinementKind]()
     for kind, refined in refinements.items():
         with contextlib.suppress(YidError):
             finer = refined()
@@ -384,25 +384,16 @@ def parameter_shifts_at_finer_discretisation(
             if excess - rest > max(_MIN_NOTED_SHARE * excess, _MIN_NOTED_FALL * len(left)):
                 said = f"{words} would remove {100 * (1 - rest / excess):.0f} % of the error beyond noise".capitalize()
                 notes[key] = f"{said}. First set {finer}, and run `solve` again."
-    if kinds and (moved := _shifts_by_more_encoder_noise(problem, x, at_x)):
+    if kinds and (moved := _shifts_by_more_encoder_noise(problem, x)):
         found["encoder_noise"] = moved
     names = problem.shared_parameters if found else ()
     return {n: EstimateShiftByDiscretisation(**{key: own[n] for key, own in found.items()}) for n in names}, notes
 
 
-def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array, at_x: Evaluation) -> dict[str, float]:
-    """Shifts of the estimates if the angles that move an object get the noise of their encoders once more.
-
-    It makes the object vibrate, so a fit finds too much damping (Cook and Stefanski 1994, simulation extrapolation,
-    doi:10.1080/01621459.1994.10476871). The scatter of draws counts half. Empty if no angles move an object.
-    """
-    rng, moves, system = np.random.default_rng(0), list[dict[str, float]](), problem.system
-    has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
-    for _ in range(_N_NOISE_DRAWS if has_encoders and system.unprescribed_coordinate_indices else 0):
-        noisy = _FinerModel(problem.with_episodes(episodes_with_noisier_motion(problem, rng), ()))
-        made = _gauss_newton_step_in_finer_model(noisy, problem, x, at_x, has_other_motion=True)
-        moves += [] if isinstance(made, str) else [made[0]]
-    shifts = {name: np.array([own[name] for own in moves]) for name in problem.shared_parameters if moves}
+def _shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array) -> dict[str, float]:
+    """Shifts of the shared estimates by encoder noise. The scatter of draws counts half. Empty without such noise."""
+    moves = unknown_shifts_by_more_encoder_noise(problem, x)
+    shifts = {name: moves[:, problem.unknown_names.index(name)] for name in problem.shared_parameters if len(moves)}
     return {name: math.copysign(math.hypot(own.mean(), own.std() / 2), own.mean()) for name, own in shifts.items()}
 
 

@@ -96,7 +96,8 @@ def linearize_candidates(
     placed = problem.problem_with_effects_and_relinearized_filters(base, values)
     series, rows = channels_with_residual_indices(problem.problem), problem.problem.residual_rows
     x = placed.pack_unknowns(values)
-    scatter = null_test.encoder_noise_residual_covariance_factor(placed, x)[rows.data]
+    unbiased = null_test.unknowns_without_encoder_noise_bias(placed, x)
+    scatter = null_test.encoder_noise_residual_covariance_factor(placed, unbiased)[rows.data]
     is_in_scatter = np.any(scatter, axis=1)
     is_noisy = placed.system.prescribed and not is_in_scatter.all()
     rng, draws = np.random.default_rng(1), range(_N_BIAS_DRAWS if is_noisy else 0)

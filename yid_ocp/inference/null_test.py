@@ -19,6 +19,7 @@ import scipy.special
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import grouped
 from yid_ocp.inference import whitening
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import episode_residual_and_jacobian
@@ -31,9 +32,12 @@ from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
+_N_BIAS_DRAWS = 6  # of encoder noise, for the shifts of estimates
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
+EXTRAPOLATION_FACTOR = 2.0
+"""Distance to many links, short steps or no encoder noise, over the shift of one refinement: m + m/2 + m/4 + ..."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +131,42 @@ def whiten_with_drawn_errors(residual: Array, known: Array, drawn: Array) -> Arr
 
 def whiten_with_encoder_noise(problem: EstimationProblem, x: Array, residual: Array) -> Array:
     """Whiten the residual (nr,) of a fit at `x` for the noise of encoders that move the model, too."""
-    by_path = encoder_noise_residual_covariance_factor(problem, x)
+    by_path = encoder_noise_residual_covariance_factor(problem, unknowns_without_encoder_noise_bias(problem, x))
     return whiten_with_drawn_errors(residual, by_path[:, :0], by_path)
+
+
+def unknown_shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array) -> Array:
+    """Compute the shifts (K, nx) of a fit `x` if the angles that move an object get the noise of their encoders again.
+
+    It makes the object vibrate, so a fit finds too much damping (Cook and Stefanski 1994, simulation extrapolation,
+    doi:10.1080/01621459.1994.10476871). K is 0 if no angles move an object.
+    """
+    rng, scale, moves = np.random.default_rng(0), problem.unknown_scales, list[Array]()
+    low, high = ((bound - x) / scale for bound in problem.bounds)
+    for _ in range(_N_BIAS_DRAWS if _encoders_move_object(problem) else 0):
+        noisy = problem.with_episodes(episodes_with_noisier_motion(problem, rng), (), problem.whitening_filters)
+        seen = noisy.evaluate(x)
+        if seen.ok and seen.jacobian is not None:
+            step = bounded_levenberg_marquardt_step(seen.jacobian * scale, seen.residual, 0.0, low, high)
+            moves.append(scale * step)
+    return np.array(moves).reshape(-1, len(x))
+
+
+def unknowns_without_encoder_noise_bias(problem: EstimationProblem, x: Array) -> Array:
+    """Return a fit `x` (nx,) without the shift by encoder noise, at most halfway to bounds.
+
+    Damping that is estimated too large hides how far the noise of encoders moves the object.
+    """
+    moves = unknown_shifts_by_more_encoder_noise(problem, x)
+    if not len(moves):
+        return x
+    return np.clip(x - EXTRAPOLATION_FACTOR * moves.mean(axis=0), *((x + bound) / 2 for bound in problem.bounds))
+
+
+def _encoders_move_object(problem: EstimationProblem) -> bool:
+    system = problem.system
+    has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
+    return bool(has_encoders and system.unprescribed_coordinate_indices)
 
 
 def encoder_noise_residual_covariance_factor(
@@ -144,8 +182,7 @@ def encoder_noise_residual_covariance_factor(
     nothing = np.zeros((problem.residual_rows.weak_priors.stop, 0))
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
     rows = [c.residual_indices for c in channels_with_residual_indices(problem) if c.group in points]
-    moves_object = problem.system.prescribed and problem.system.unprescribed_coordinate_indices
-    if not rows or not moves_object or (before := residual_of(problem)) is None:
+    if not rows or not _encoders_move_object(problem) or (before := residual_of(problem)) is None:
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):

@@ -28,8 +28,7 @@ MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
 HOPELESS_CHI2 = 1e3  # per degree of freedom: units, signs or names are probably wrong
 _POSSIBLE_NOISE_CHI2 = 25.0  # per degree of freedom, up to which stated noise that is too small can be the cause
-# A standard deviation of this many times the value (or its typical size) counts as infinite.
-MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
+MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6  # of the value (or its typical size)
 _AT_BOUND_FRACTION = 1e-4  # distance from a bound, over the unknown's typical size, that counts as at the bound
 # 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
 _CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
@@ -37,8 +36,7 @@ _CHI2_95_ONE_SIDED, CHI2_95_TWO_SIDED = 2.705543454095404, 3.841458820694124
 _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH = 24, 0.25, 2.0
 # With at least this many recordings, or channels of recordings, scores are clustered by these.
 _MIN_CLUSTER_RECORDINGS, _MIN_CLUSTER_CHANNELS = 4, 8
-# The Gaussian approximation is rejected if the cost rises by less than this fraction of the predicted rise.
-_MIN_COST_RISE_RATIO = 0.5
+_MIN_COST_RISE_RATIO = 0.5  # of the predicted rise, below which the Gaussian approximation is rejected
 # Two rollouts for each of more parameters take longer than the search itself.
 _MAX_CHECKED_PARAMETERS = 12
 _PRIOR_STD_RATIO = 3.0  # factor on a standard deviation without priors, from which on priors determine an unknown
@@ -143,20 +141,22 @@ def null_tests_of_fit(
     shared, filters = len(problem.shared_parameters), problem.held_out_whitening_filters
     predicted = predicted or problem.predict_held_out(x, True)
     own = problem.with_episodes([episode for episode, _ in predicted], ())  # with their fitted initial states
+    point = null_test.unknowns_without_encoder_noise_bias(problem, x)
 
     def residual_of(moved: EstimationProblem) -> Array | None:
         other = problem.with_episodes(problem.episodes, moved.episodes, problem.whitening_filters, filters)
         with contextlib.suppress(SolverError):
-            return np.concatenate([part.residual for part in other.held_out_residuals(other.predict_held_out(x))])
+            return np.concatenate([part.residual for part in other.held_out_residuals(other.predict_held_out(point))])
         return None
 
     found = problem.held_out_residuals(predicted)
     residual = np.concatenate([part.residual for part in found])
     slopes = np.vstack([np.asarray(part.jacobian)[:, :shared] for part in found])
     by_parameters = np.asarray(slopes @ noise_only_covariance_sqrt(problem, evaluation)[:shared])
-    by_path = null_test.encoder_noise_residual_covariance_factor(own, x, residual_of)[: len(residual)]
+    by_path = null_test.encoder_noise_residual_covariance_factor(own, point, residual_of)[: len(residual)]
     residual = null_test.whiten_with_drawn_errors(residual, by_parameters, by_path)
-    fitted = null_test.whiten_with_encoder_noise(problem, x, evaluation.residual)
+    by_path = null_test.encoder_noise_residual_covariance_factor(problem, point)
+    fitted = null_test.whiten_with_drawn_errors(evaluation.residual, by_path[:, :0], by_path)
     count = effective_parameter_count(problem, evaluation)
     before, held_out = (
         null_test.residual_chi2_null_test(null_test.channels_with_residual_indices(of), r, parameters, level)

@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 
 from yid_ocp.analysis import run_estimates
-from yid_ocp.analysis.discretisation import EXTRAPOLATION_FACTOR
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
@@ -22,6 +21,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.display import Progress, abbreviated_names_text
 from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.files import attributes_to_dict, file_sha256, is_file, read_input_json
+from yid_ocp.inference.null_test import EXTRAPOLATION_FACTOR
 from yid_ocp.model.objects import ObjectBuilder
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import ChannelPrediction
