@@ -402,7 +402,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     shown = {n: value_and_uncertainty_text(*own, verdict=fitted[n]["verdict"]) for n, own in told.items()}
     lost = abbreviated_names_text([name for name in friction if shown[name] == "–"])
     is_absent = bool(friction) and all(shown[name] == "–" for name in friction)
-    heads = ("error", "standard error", f"difference from '{best}'", "standard error of the difference", "note")
+    heads = ("rms error", "± (between motions)", f"beyond that of '{best}'", "± of this difference", "note")
     rows: TableRows = [("law", *heads)]
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
@@ -431,7 +431,8 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         known = {words[n]: shown[n] for n in friction if n.rpartition(".")[0].rpartition("@")[2] == joint}
         constants.append((joint, *(known.get(column, "") for column in columns)))
     yield SummaryTable(constants, f"Constants of the law '{best}' (± is one standard deviation)")
-    yield SummaryTable(rows, f"Held-out error of each law [{unit}]", is_key_table=True)
+    scale = "standard deviations of the noise" if unit == "std" else unit
+    yield SummaryTable(rows, f"Held-out error of each law [{scale}]", is_key_table=True)
     others = [(name, value, shown_unit(fitted[name]["unit"])) for name, value in shown.items() if name not in friction]
     yield SummaryTable([("parameter", "value", "unit"), *others], "Other parameters of this fit")
     yield "Values in brackets are 95 % intervals." if any("(" in value for value in shown.values()) else ""
