@@ -477,25 +477,31 @@ def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder,
     path = (0.25 * (np.tanh(8 * (t - 0.6)) + np.tanh(4.8)) + 0.3 * np.sin(2 * t) * np.minimum(1, t) ** 2)[:, None]
     rollout = simulate(step, system.parameters.vector(), np.zeros(step.sizes["nx"]), 800, path=path)
     rng = np.random.default_rng(1)
-    seen = places(system, ("tip",), rollout.state[:, :2])
-    seen, angles = (own + std * rng.standard_normal(own.shape) for own, std in ((seen, 1e-3), (path, noise)))
-    group, arm = PointGroup("points", ("tip",), t, seen, 1e-3), JointGroup(["shoulder"], t, angles, position_std=noise)
-    recording = Recording(arm, (group,), name="rod")
-    given = EstimationProblem(step, [recording], ("elbow.damping",), ProblemOptions(path_cutoff=40.0))
+    tip = places(system, ("tip",), rollout.state[:, :2])
+
+    def recorded(name):
+        seen, angles = (own + std * rng.standard_normal(own.shape) for own, std in ((tip, 1e-3), (path, noise)))
+        arm = JointGroup(["shoulder"], t, angles, position_std=noise)
+        return Recording(arm, (PointGroup("points", ("tip",), t, seen, 1e-3),), name=name)
+
+    options = ProblemOptions(path_cutoff=40.0)
+    given = EstimationProblem(step, [recorded("rod")], ("elbow.damping",), options, held_out=[recorded("other")])
     fit = fit_problem(given, GaussNewton())
     if noise == 2e-3:  # damping that is too large would hide how far the noise moves the rod
         less, residual = null_test.unknowns_without_encoder_noise_bias(given, fit.x), fit.evaluation.residual
         assert 0.0 < less[0] - 0.02 < 0.5 * (fit.x[0] - 0.02)
         biased = null_test.encoder_noise_residual_covariance_factor(given, fit.x)
         hidden = null_test.whiten_with_drawn_errors(residual, biased[:, :0], biased)
-        assert np.linalg.norm(null_test.whiten_with_encoder_noise(given, fit.x, residual)) < 0.998 * np.linalg.norm(
-            hidden
-        )
+        whitened = null_test.whiten_with_encoder_noise(given, fit.x, residual)
+        assert np.linalg.norm(whitened) < 0.998 * np.linalg.norm(hidden)
     found = add_intervals_and_checks(given, fit)
     entry, data_std = found.parameters["elbow.damping"], found.checks.data_std["elbow.damping"]
     shift = found.checks.discretisation_shifts["elbow.damping"].encoder_noise
     assert (abs(entry.value - 0.02) > 5 * data_std) == (abs(shift) > data_std) == moved
     assert abs(entry.value - 0.02) < 2 * entry.std
+    [(_, outcome)], expected = found.checks.held_out_predictions, found.checks.expected_prediction_errors["other"]
+    error = np.sqrt(np.mean(np.sum((outcome.predicted_outputs[0] - tip[:, 0]) ** 2, axis=1)) + 3e-6)
+    assert expected["points.tip"] == pytest.approx(error, rel=0.25)
     # the scatter of single draws, of either sign, no longer hides the mean
     assert noise < 1e-3 or shift > 0.3 * (entry.value - 0.02)
     if moved:

@@ -19,11 +19,20 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.files import attributes_to_dict
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.linearized_residual import size_limited_damped_step
+from yid_ocp.inference.null_test import (
+    encoders_move_object,
+    episode_with_noisier_motion,
+    unknowns_without_encoder_noise_bias,
+)
 from yid_ocp.model.objects.base import CableVertices
 from yid_ocp.model.objects.cable import INITIAL_RMS_SPEED_PARAMETER, SHAPE_MEMORY_HALVING_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodeAndPredictionOrFailure, EpisodePrediction
-from yid_ocp.problem.estimation_problem import checked_unknowns, held_out_prediction_arguments
+from yid_ocp.problem.estimation_problem import (
+    checked_unknowns,
+    held_out_parameter_vector,
+    held_out_prediction_arguments,
+)
 from yid_ocp.problem.measurements import SensorMeasurements, measurements_minus_sensor_error_estimates
 from yid_ocp.problem.predictions import naive_cable_predictions, rmse_unit_count_dicts_by_channel
 from yid_ocp.sensors.base import Sensor
@@ -253,7 +262,7 @@ BASELINE_DESCRIPTIONS = {
 }
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
 _MAX_STDS_FROM_PRIOR = 5.0  # a stated prior that is farther from the estimate is wrong
-_N_TORQUE_ERROR_DRAWS = 8  # motions with errors drawn from the noise of the torques
+_N_ERROR_DRAWS = 8  # motions with errors drawn from the noise of torques, or of encoders
 _MAX_OFFSET_IN_STDS = 3.0  # of a constant error or clock that counts as noise
 
 
@@ -300,8 +309,9 @@ def _prediction_error_entry(
 def _predict_held_out_with_expected_errors(
     problem: EstimationProblem, x: Array
 ) -> tuple[list[EpisodeAndPredictionOrFailure], dict[str, dict[str, float]]]:
-    """Predict the held-out recordings, and compute by channel the rms errors that sensor and torque noise cause."""
+    """Predict held-out recordings, and compute by channel the rms errors by noise of sensors, torques and encoders."""
     predict, rng = problem.predictor.predict_episode, np.random.default_rng(0)
+    unbiased = unknowns_without_encoder_noise_bias(problem, x) if problem.held_out else x
     pairs, expected = list[EpisodeAndPredictionOrFailure](), dict[str, dict[str, float]]()
     share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
     for episode, theta, offset in held_out_prediction_arguments(problem, x):
@@ -311,31 +321,45 @@ def _predict_held_out_with_expected_errors(
             continue
         drawn: list[EpisodePrediction | str] = []
         if (errors := episode.input_errors) is not None:
-            for _ in range(_N_TORQUE_ERROR_DRAWS):
+            for _ in range(_N_ERROR_DRAWS):
                 samples = rng.standard_normal((int(errors.sample_of_step[-1]) + 1, len(errors.torque_std)))
                 white = errors.torque_std * samples[errors.sample_of_step]
                 bias = errors.torque_bias + errors.torque_bias_std * rng.standard_normal(len(errors.torque_std))
                 moved = replace(errors, torque_bias=bias, torque_noise=errors.torque_noise + white)
                 other = replace(episode, input_errors=moved)
                 drawn.append(predict(other, theta, offset, False, outcome.equilibrium_guess))
-        errors_of_stated_stds = _expected_errors(episode, outcome, drawn).items()
+        changes = _prediction_changes(outcome, drawn)
+        if encoders_move_object(problem):
+            theta = held_out_parameter_vector(problem, unbiased, episode)
+            noisy = (episode_with_noisier_motion(episode, problem, rng) for _ in range(_N_ERROR_DRAWS))
+            base, *drawn = (predict(own, theta, offset, False, outcome.equilibrium_guess) for own in (episode, *noisy))
+            # stated errors of efforts contain the noise of encoders already
+            kept = [not samples.sensor.effort_joints for samples in episode.measurements]
+            moves = [] if isinstance(base, str) else _prediction_changes(base, drawn)
+            changes += [[change * own for change, own in zip(move, kept, strict=True)] for move in moves]
+        errors_of_stated_stds = _expected_errors(episode, outcome, changes).items()
         expected[episode.name] = {channel: share * rms for channel, rms in errors_of_stated_stds}
     return pairs, expected
 
 
+def _prediction_changes(base: EpisodePrediction, drawn: Sequence[EpisodePrediction | str]) -> list[list[Array]]:
+    """Changes of the outputs of each sensor by each draw of an error, divided by the root of the number of draws."""
+    able = [own.predicted_outputs for own in drawn if not isinstance(own, str)]
+    pairs = (zip(own, base.predicted_outputs, strict=True) for own in able)
+    return [[(after - before) / math.sqrt(len(able)) for after, before in own] for own in pairs]
+
+
 def _expected_errors(
-    episode: Episode, outcome: EpisodePrediction, drawn: Sequence[EpisodePrediction | str]
+    episode: Episode, outcome: EpisodePrediction, changes: Sequence[Sequence[Array]]
 ) -> dict[str, float]:
     found: dict[str, float] = {}
-    able = [own for own in drawn if not isinstance(own, str)]
     without = measurements_minus_sensor_error_estimates(episode.measurements, outcome.predicted_outputs)
     for k, (samples, corrected) in enumerate(zip(episode.measurements, without, strict=True)):
         square = np.where(np.isfinite(samples.value), samples.std, np.nan) ** 2
         # by constant errors and the clock's offset, but no larger ones than expected
         most = _MAX_OFFSET_IN_STDS**2 * np.sum(samples.output_changes_per_bias_and_clock_std**2, axis=2)
         square = square + np.minimum((samples.value - corrected.value) ** 2, most)
-        for own in able:
-            square = square + (own.predicted_outputs[k] - outcome.predicted_outputs[k]) ** 2 / len(able)
+        square = square + sum(own[k] ** 2 for own in changes)
         found |= _rms_by_channel(samples.sensor, square)[0]
     return found
 

@@ -143,7 +143,7 @@ def unknown_shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array) -
     """
     rng, scale, moves = np.random.default_rng(0), problem.unknown_scales, list[Array]()
     low, high = ((bound - x) / scale for bound in problem.bounds)
-    for _ in range(_N_BIAS_DRAWS if _encoders_move_object(problem) else 0):
+    for _ in range(_N_BIAS_DRAWS if encoders_move_object(problem) else 0):
         noisy = problem.with_episodes(episodes_with_noisier_motion(problem, rng), (), problem.whitening_filters)
         seen = noisy.evaluate(x)
         if seen.ok and seen.jacobian is not None:
@@ -163,7 +163,8 @@ def unknowns_without_encoder_noise_bias(problem: EstimationProblem, x: Array) ->
     return np.clip(x - EXTRAPOLATION_FACTOR * moves.mean(axis=0), *((x + bound) / 2 for bound in problem.bounds))
 
 
-def _encoders_move_object(problem: EstimationProblem) -> bool:
+def encoders_move_object(problem: EstimationProblem) -> bool:
+    """Check whether measured angles of prescribed joints move coordinates that are not prescribed."""
     system = problem.system
     has_encoders = system.prescribed and any(episode.recording.joints for episode in problem.episodes)
     return bool(has_encoders and system.unprescribed_coordinate_indices)
@@ -182,7 +183,7 @@ def encoder_noise_residual_covariance_factor(
     nothing = np.zeros((problem.residual_rows.weak_priors.stop, 0))
     points = {group.name for episode in problem.episodes for group in episode.recording.points}
     rows = [c.residual_indices for c in channels_with_residual_indices(problem) if c.group in points]
-    if not rows or not _encoders_move_object(problem) or (before := residual_of(problem)) is None:
+    if not rows or not encoders_move_object(problem) or (before := residual_of(problem)) is None:
         return nothing
     rng, at, found = np.random.default_rng(0), np.concatenate(rows), []
     for _ in range(_N_PATH_NOISE_DRAWS):
@@ -194,11 +195,12 @@ def encoder_noise_residual_covariance_factor(
 
 
 def episodes_with_noisier_motion(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
-    """Return the recordings with one more random draw of encoder noise in the prescribed motion, not in sensor data."""
-    return [_with_path_noise_redrawn(own, problem, rng) for own in problem.episodes]
+    """Return the estimation recordings, each as `episode_with_noisier_motion`."""
+    return [episode_with_noisier_motion(own, problem, rng) for own in problem.episodes]
 
 
-def _with_path_noise_redrawn(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
+def episode_with_noisier_motion(episode: Episode, problem: EstimationProblem, rng: np.random.Generator) -> Episode:
+    """Return a recording with one more random draw of encoder noise in the prescribed motion, not in sensor data."""
     joints, system, options = episode.recording.joints, problem.system, problem.options
     names = () if joints is None else tuple(name for name in system.prescribed if name in joints.names)
     if joints is None or not names or len(joints.t) <= NOISE_ESTIMATE_DIFFERENCE_ORDER:
