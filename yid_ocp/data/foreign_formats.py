@@ -58,8 +58,11 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
             return name if unit else "", unit
     if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
         name = suffixed[1]
+        unit = UNIT_BY_WORD[suffixed[2].lower()]
         if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
-            return name, UNIT_BY_WORD[suffixed[2].lower()]
+            return name, unit
+        if unit in ("deg", "rad"):
+            return f"q_{name}", unit  # the angle of the joint of this name
     return column, ""
 
 

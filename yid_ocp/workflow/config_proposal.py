@@ -214,11 +214,7 @@ def propose_config_choices(
 
 
 def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Recording]) -> list[str]:
-    """Joints of the URDF that the first recording has. Raises `ConfigError` if it has none or a recording no joints."""
-    for other in (recording for recording in recordings if recording.joints is None):
-        hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
-        what, allowed = f"recording '{other.name}' has no joint angles", "a recording with joint states of the robot"
-        raise ConfigError(what, where=f"recording '{other.name}'", allowed=allowed, hint=hint)
+    """Joints of the URDF that the first recording has. Raises `ConfigError` if there are none."""
     if not whole.joint_names:
         what, hint = "the robot has no joint that can move", "give the URDF or MJCF file of the whole robot"
         raise ConfigError(what, where=robot, allowed="revolute, continuous or prismatic joints", hint=hint)
@@ -398,7 +394,7 @@ def _places(
             parts = _parts_when_straight(positions, poses, branches)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
-            frame, reason, std = "", "its place on the model is not known", 0.0
+            frame, reason, std = "", "the place on the model is not known", 0.0
             beside: tuple[float, ...] = ()
             if point in frames or (colon and owner in names and part.endswith("%")):
                 frame, reason = point, "their names are equal"
@@ -407,7 +403,7 @@ def _places(
             elif not standing:
                 straight = math.nan if parts is None else float(parts[i])
                 if beside := _place_beside_object(poses, positions[:, i], branches, axis):
-                    frame, reason = holder, f"it moves with {holder}, and is not on the object"
+                    frame, reason = holder, f"the position relative to {holder} is constant, and is not on the object"
                 else:
                     frame, reason = _near(poses, positions[:, i], straight, branches, holder)
                 if frame and len(branches) == 1:
@@ -482,7 +478,7 @@ def _near(
     """Return the most probable frame of a point (empty if unknown), from its distance to the holder, and the reason."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
-        return "", "it was never seen"
+        return "", "no sample has a position"
     poses = poses[seen]
     from_holder = position[seen] - poses[:, :3, 3]
     if len(branches) == 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -108,12 +109,20 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     return factors
 
 
-def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str, str]:
-    """Return new joint names by recorded one, from `name` or `recorded=name`. `DataError` if empty or repeated."""
-    found: dict[str, str] = {}
+def parse_old_to_new_joint_names(entries: Iterable[str], known: Iterable[str], where: str) -> dict[str, str]:
+    """Return new joint names by recorded one, from `name` or `recorded=name`. `DataError` if empty or repeated.
+
+    A `*` is any text, the same on both sides; it stands for all `known` names that match.
+    """
+    pairs, found = list[tuple[str, str, str]](), dict[str, str]()
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
+        pattern = re.compile(re.escape(recorded).replace(r"\*", "(.*)", 1))
+        is_pattern = recorded.count("*") == name.count("*") == 1
+        matches = [own for own in map(pattern.fullmatch, known) if own] if is_pattern else []
+        pairs += [(entry, own[0], name.replace("*", own[1])) for own in matches] or [(entry, recorded, name)]
+    for entry, recorded, name in pairs:
         if not recorded or not name:
             allowed, hint = "NAME, or RECORDED=NAME of a joint", "write for example --joints q1=shoulder,q2=elbow"
             raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
@@ -146,7 +155,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     if group is not None:
         names = {name: name for name in group.names}
         if options.joints is not None:
-            names = parse_old_to_new_joint_names(options.joints, where)
+            names = parse_old_to_new_joint_names(options.joints, group.names, where)
             require_known_names(names, group.names, "joint", f"--joints, {where}", DataError)
         at, recorded = [group.names.index(name) for name in names], group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}
