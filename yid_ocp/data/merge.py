@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, mean_sample_rate, median_sample_period
+from yid_ocp.data.channel_checks import LATE_POINTS_WORDS, QUALITY_LIMITS, median_sample_period
 from yid_ocp.data.readers.base import guess_non_si_units, joints_on_fastest_clock
 from yid_ocp.data.recording import Recording, validated_recording
 from yid_ocp.errors import DataError, require_known_names
@@ -23,7 +24,7 @@ _MIN_SAID_LAG = 0.02  # [s]
 _MAX_GRID, _MAX_BRIDGED = 20000, 0.1  # samples of the search of lags; gap of points that it bridges [s]
 _MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
 _ALIGNED_CLOCK_STD = 0.03  # of an offset that the motion tells, which an object that swings behind shifts [s]
-_LARGEST_RATE = 2e4  # of a sensor [Hz]; a camera whose seconds are read as milliseconds has more
+_LEAST_PERIOD = 5e-5  # of a sensor [s]; a camera whose seconds are read as milliseconds has less
 _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 
 
@@ -91,18 +92,13 @@ def _span(recording: Recording) -> tuple[float, float]:
     return float(min(t[0] for t in clocks)), float(max(t[-1] for t in clocks))
 
 
-def _rate(recording: Recording) -> float:
-    return max((mean_sample_rate(group.t) for group in recording.all_groups if len(group.t) > 1), default=0.0)
-
-
 def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     """Shift [s] to add to the times of `other`, and the reason. Raises `DataError` if the clocks cannot be aligned."""
     (begin, end), (start, stop) = _span(first), _span(other)
     overlap, shortest = min(end, stop) - max(begin, start), min(end - begin, stop - start)
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
-    fastest_first = sorted((first, other), key=_rate, reverse=True)
-    for recording, beside in (fastest_first, fastest_first[::-1]):
-        _check_time_unit(recording, beside, shortest, default="ms" if shared else "")
+    for recording in sorted((first, other), key=_least_period):
+        _check_time_unit(recording, shortest, default="ms" if shared else "")
     part = f"their times overlap by {overlap:.4g} of {max(end - begin, stop - start):.4g} s"
     said = f"{first.name} and {other.name} are assumed to have one clock ({part})"
     if shared:
@@ -134,21 +130,22 @@ def _late_points(first: Recording, other: Recording, name: str, applied: float) 
     return f"{said}clock, import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
 
 
-def _check_time_unit(recording: Recording, beside: Recording, duration: float, default: str) -> None:
-    """Raise `DataError` if hardly any of many samples lies in `duration` [s] and the unit shows or has a `default`.
+def _least_period(recording: Recording) -> float:
+    return min(median_sample_period(group.t) or math.inf for group in recording.all_groups)
 
-    Raise it, too, if the rate is too high for a sensor, and much higher than the one of the recording `beside`.
-    """
+
+def _check_time_unit(recording: Recording, duration: float, default: str) -> None:
+    """Raise `DataError` if hardly any of many samples lies in `duration` [s] and the unit shows or has a `default`."""
     name, unit = recording.name, guess_non_si_units(recording)[0].get("t", default)
     total = max(len(group.t) for group in recording.all_groups)
     inside = max(np.count_nonzero(group.t - group.t[0] <= duration) for group in recording.all_groups)
-    what, hint = "", f"import {name} alone with --units t={unit}, and list its .h5 in its place"
-    if (rate := _rate(recording)) > max(_LARGEST_RATE, 10 * _rate(beside)):
-        what = f"{name} would have {rate:.3g} samples per second, so its times seem to have another unit"
-        hint = f"import {name} alone, without a unit of t or with the right one, and list its .h5 in its place"
-    elif unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
+    is_too_fast = (period := _least_period(recording)) < _LEAST_PERIOD
+    if is_too_fast or (unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples):
         what = f"only {inside} of {total} samples of {name} lie in {duration:.4g} s, so its times seem to be in {unit}"
-    if what:
+        hint = f"import {name} alone with --units t={unit}, and list its .h5 in its place"
+        if is_too_fast:
+            what = f"the samples of {name} would be {period:.3g} s apart, so its times seem to have another unit"
+            hint = f"import {name} alone, without a unit of t or with the right one, and list its .h5 in its place"
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 

@@ -323,13 +323,9 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
     return numbers
 
 
-def _check_bodies(link: str, inertial: SimpleNamespace, where: str) -> None:
-    """Refuse negative moments of inertia of a mass, and warn of moments that no mass distribution has."""
-    least, middle, most = np.linalg.eigvalsh(0.5 * (inertial.inertia + inertial.inertia.T))
-    if not inertial.mass:
-        if most > 0:
-            log.warning("%s: link '%s' has moments of inertia, but no mass. They are not used", Path(where).name, link)
-        return
+def _check_bodies(link: str, tensor: Array, where: str) -> None:
+    """Refuse negative moments of inertia, and warn of moments that no mass distribution has."""
+    least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
     if least < -max(_PRINCIPAL_MOMENT_RTOL * max(most, -least), _PRINCIPAL_MOMENT_ATOL):
         what = f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)"
@@ -404,9 +400,11 @@ def _walk(
         link, carrier, at, parent = stack.pop()
         frames[link] = (carrier, at, parent)
         inertial = links[link]
-        if inertial is not None and carrier is not None:
-            _check_bodies(link, inertial, where)
+        if inertial is not None and carrier is not None and not inertial.mass and inertial.inertia.any():
+            log.warning("%s: link '%s' has moments of inertia, but no mass. They are not used", Path(where).name, link)
         if inertial is not None and inertial.mass:
+            if carrier is not None:
+                _check_bodies(link, inertial.inertia, where)
             body = Inertia.from_values(inertial.mass, np.zeros(3), inertial.inertia)
             bodies[link] = body.transformed_by(Placement.from_matrix(at @ inertial.origin))
         for joint in robot.joints:

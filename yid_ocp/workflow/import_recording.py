@@ -25,6 +25,7 @@ from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
+_AGAIN = "repeat this command with --units {}"
 DO_NOT_USE = "{} has the values as read: do not use it before the advice above is followed"
 _LISTS = ("joint_topics", "joints")
 _KINDS = {name: mapping_value_type(entry.type_hint) for name, entry in class_options_by_key(ImportSettings).items()}
@@ -130,13 +131,8 @@ def _proposal_lines(
     return ["", *issues, f"to import {what}:", f"  {command}"], True
 
 
-def recording_issue_lines(
-    recording: Recording, repeat: str = "repeat this command with --units {}"
-) -> tuple[list[str], bool]:
-    """Return lines about the issues of a recording that show without a model, and whether one of them is severe.
-
-    `repeat` says how to read the file again with a unit in place of `{}`.
-    """
+def recording_issue_lines(recording: Recording, again: str = _AGAIN) -> tuple[list[str], bool]:
+    """Return lines about issues that show without a model, and whether one is severe. `again` states the cure `{}`."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -147,7 +143,7 @@ def recording_issue_lines(
         told = (f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n" for own in alike)
         said.append(f"{''.join(told)}  try: {cure}")
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        said.append(f"issue (likely): {reason}\n  try: {repeat.format(f'{quantity}={unit}')}")
+        said.append(f"issue (likely): {reason}\n  try: {again.format(f'{quantity}={unit}')}")
     is_severe = bool(units) or any(own.severity != "warning" for own in found)
     return [*said, ""] if said else [], is_severe
 

@@ -62,8 +62,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    _require_joints(arguments, recordings)
-    lines, is_severe = _issue_lines(made, recordings)
+    options = import_recording.reader_options_from_arguments(arguments)
+    lines, is_severe = _issue_lines(arguments.files, options, made.values(), recordings)
     segments, grasps = [] if item is None else item.settings.segment_definitions(), _grasps(arguments.grasp)
     asked = {"holder": arguments.holder, "grasps": grasps, "standing": item is not None and item.stands_in_world}
     proposal = propose_config_choices(robot, recordings, segments, **asked)
@@ -81,7 +81,6 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
-    options = import_recording.reader_options_from_arguments(arguments)
     about = f"{'An arm of position servos' if proposal.arm_mode == 'servo' else 'The arm'}, {where}, with a payload."
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
     _write(out, _config_text(where, about, item, proposal, files, options), written)
@@ -169,26 +168,23 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
     return made
 
 
-def _require_joints(arguments: argparse.Namespace, recordings: Sequence[Recording]) -> None:
-    pairs = list(zip(arguments.files, recordings, strict=True))
-    joints = next((file for file, recording in pairs if recording.joints is not None), "JOINTS")
-    for file, recording in pairs:
+def _issue_lines(
+    files: Sequence[str], options: Mapping[str, Any], new: Iterable[Recording | None], recordings: Sequence[Recording]
+) -> tuple[list[str], bool]:
+    """Lines on issues, and whether one is severe. `new` is not None for files of other tools. All must have joints."""
+    lines, is_severe = list[str](), False
+    joints = next((file for file, own in zip(files, recordings, strict=True) if own.joints is not None), "JOINTS")
+    for file, made, recording in zip(files, new, recordings, strict=True):
         if recording.joints is None:
-            options = import_recording.reader_options_from_arguments(arguments)
-            command = import_recording.import_command_line([joints, file], options)
             what, allowed = f"recording '{recording.name}' has no joint angles", "recordings with joint states"
+            command = import_recording.import_command_line([joints, file], options)
             hint = f"merge it with the joints of its run, and give `init` the result: {command}"
             raise ConfigError(what, where=file, allowed=allowed, hint=hint)
-
-
-def _issue_lines(made: Mapping[Path, Recording | None], recordings: Sequence[Recording]) -> tuple[list[str], bool]:
-    """Lines about issues of the recordings, and whether one is severe. Only a file of another tool has other units."""
-    told = list[tuple[list[str], bool]]()
-    for new, recording in zip(made.values(), recordings, strict=True):
         hint = "import the original file again with --units {}, and give the result in place of this one"
-        hint = hint if new is None else "repeat this command with --units {} --replace"
-        told.append(import_recording.recording_issue_lines(recording, hint))
-    return [line for lines, _ in told for line in lines if line], any(is_severe for _, is_severe in told)
+        hint = hint if made is None else "repeat this command with --units {} --replace"
+        own, is_own_severe = import_recording.recording_issue_lines(recording, hint)
+        lines, is_severe = [*lines, *filter(None, own)], is_severe or is_own_severe
+    return lines, is_severe
 
 
 def _split(

@@ -110,10 +110,7 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
 
 
 def parse_old_to_new_joint_names(entries: Iterable[str], known: Iterable[str], where: str) -> dict[str, str]:
-    """Return new joint names by recorded one, from `name` or `recorded=name`. `DataError` if empty or repeated.
-
-    A `*` is any text, the same on both sides; it stands for all `known` names that match.
-    """
+    """Return new names by `known` joint, from `name` or `recorded=name`; `*`: any text. `DataError` if not unique."""
     pairs, found = list[tuple[str, str, str]](), dict[str, str]()
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))

@@ -368,7 +368,6 @@ def _parsed_number(cell: str) -> float:
 def _numbers(
     cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], marks: set[str], where: str
 ) -> list[float]:
-    """Numbers of a row. `marks` are the decimal marks of the rows before, and get those of this row."""
     if len(cells) != len(header):
         what = f"the row has {count_with_noun(len(cells), 'cell')}, but the header has {len(header)}"
         allowed = "as many as the header"
