@@ -266,8 +266,7 @@ _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and 
 _SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
 _SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
-_HEADINGS = {"import": "prepare", "solve": "estimate and explain", "plan": "use"}
-"""Headings in the list of commands, by the first command below each."""
+_HEADINGS = {"import": "prepare", "solve": "estimate and explain", "plan": "use"}  # by the first command below it
 COMMANDS = (
     _Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     _Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
@@ -289,7 +288,7 @@ COMMANDS = (
 )
 
 
-class _GroupedHelpFormatter(argparse.HelpFormatter):
+class _GroupedHelp(argparse.HelpFormatter):
     def _format_action(self, action: argparse.Action) -> str:
         heading = _HEADINGS.get(action.dest)
         return f"\n  {heading}:\n" * bool(heading) + super()._format_action(action)
@@ -357,7 +356,7 @@ def build_argument_parser() -> argparse.ArgumentParser:
     from yid_ocp import __version__
 
     about = "Stiffness of flexible objects from robot recordings."
-    top = _Parser(prog="yid-ocp", description=about, formatter_class=_GroupedHelpFormatter)
+    top = _Parser(prog="yid-ocp", description=about, formatter_class=_GroupedHelp)
     top.add_argument("--version", action="version", version=f"yid-ocp {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for row in COMMANDS:

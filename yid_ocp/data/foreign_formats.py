@@ -110,8 +110,7 @@ def _joint_force(column: str, known: Sequence[ColumnMeaning]) -> ColumnMeaning:
 _Rows = Iterable[tuple[int, list[str]]]
 _VICON_SECTIONS = ("Trajectories", "Devices", "Model Outputs", "Joints", "Segments")
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
-_MocapTable = tuple[PointGroup, str, tuple[str, ...]]
-"""Points of a motion capture export in its own unit, this unit (mm, cm or m), and notes for the user."""
+_MocapTable = tuple[PointGroup, str, tuple[str, ...]]  # points in the file's own unit, this unit, notes for the user
 
 
 def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:

@@ -27,8 +27,7 @@ _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link
 """Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
-_CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
-"""Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
+_CAMERA_STD, _MARKER_STD = 5e-3, 1e-3  # of points of slow and of fast sensors whose noise the data do not show [m]
 _MAX_RIGID_MOTION = 1e-3  # std of a marker in the frame of the gripper to which it is fixed [m]
 _MIN_AXIS_DISTANCE = 0.01  # distance of a marker on the gripper from the axis of the object [m]
 _MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
@@ -58,8 +57,7 @@ _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the hol
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
 _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "estimated from differences of consecutive samples", "as the recording states"
-_LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
-"""Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
+_LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}  # motor and LeRobot's gain, by start of name
 
 
 @dataclass(frozen=True)

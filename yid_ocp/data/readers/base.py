@@ -60,8 +60,7 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
 }
 MOTOR_CURRENT_UNITS = ("A", "mA")  # units of `effort` for motor currents
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
-_MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
-"""Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
+_MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}  # [rad], [m]; larger: degrees, millimetres
 _MIN_LARGE_FRACTION = 0.01  # of the samples, which look like degrees; fewer large ones are wrong samples
 
 
