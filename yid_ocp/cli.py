@@ -173,7 +173,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     listed = (
         ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are merged on one clock"),
         ("--field", "message_fields", "CHANNEL=/TOPIC.FIELD", "of a bag: array of any message; joints are 1, 2, ..."),
-        ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and their names in the URDF"),
+        ("--joints", "joints", "NAME[=NEW]", "joints to keep, in order, and their names in the URDF; * is any text"),
         ("--points", "point_names", "SOURCE=POINT", "topic, TOPIC:FRAME, marker or stem, and its point if it differs"),
         ("--columns", "column_meanings", "COLUMN=MEANING", "t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
         ("--units", "units", "UNIT", "units that are not SI: deg, mm, ms, or QUANTITY=UNIT"),
@@ -266,25 +266,32 @@ _SAID_IDENTIFIABILITY = "list the parameters that the recordings determine, and 
 _SAID_BLIND = "test the diagnosis on synthetic recordings with sealed effects; resumes an interrupted test"
 _SAID_REPORT = "compare runs of one model: changed parameters, deviating runs; overlay two of the same recordings"
 _SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
+_HEADINGS = {"import": "prepare", "solve": "estimate and explain", "plan": "use"}  # by the first command below it
 COMMANDS = (
+    _Command("import", "turn a file of another tool into a recording", "import_recording", _import),
+    _Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
     _Command("init", "write a commented configuration from a robot and recordings of it", "init", _init),
+    _Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
     _Command("solve", "estimate the free parameters from recordings", "solve", _solve),
-    _Command("compare", "run several methods on one problem and compare their results", "compare", _doubting),
     _Command("identifiability", _SAID_IDENTIFIABILITY, "identifiability", _identifiability),
-    _Command("friction", "choose the friction law that the recordings justify", "friction", _doubting),
     _Command("diagnose", "test for a gap between model and recordings, and name its cause", "diagnose", _diagnose),
-    _Command("blind", _SAID_BLIND, "blind", _blind),
-    _Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-    _Command("report", _SAID_REPORT, "run_history", _report),
+    _Command("friction", "choose the friction law that the recordings justify", "friction", _doubting),
+    _Command("compare", "run several methods on one problem and compare their results", "compare", _doubting),
     _Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     _Command("simulate", "simulate a recording with the model", "simulate", _simulate),
-    _Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
-    _Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    _Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
-    _Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     _Command("export", _SAID_EXPORT, "export", _export),
+    _Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
+    _Command("report", _SAID_REPORT, "run_history", _report),
+    _Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
+    _Command("blind", _SAID_BLIND, "blind", _blind),
     _Command("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
 )
+
+
+class _GroupedHelp(argparse.HelpFormatter):
+    def _format_action(self, action: argparse.Action) -> str:
+        heading = _HEADINGS.get(action.dest)
+        return f"\n  {heading}:\n" * bool(heading) + super()._format_action(action)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -348,7 +355,8 @@ def build_argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser of all commands. It raises `ConfigError` if an argument is invalid."""
     from yid_ocp import __version__
 
-    top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")
+    about = "Stiffness of flexible objects from robot recordings."
+    top = _Parser(prog="yid-ocp", description=about, formatter_class=_GroupedHelp)
     top.add_argument("--version", action="version", version=f"yid-ocp {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for row in COMMANDS:

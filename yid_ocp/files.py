@@ -43,7 +43,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
             what, allowed = "the path contains a null character", "a path without null characters"
         hint = f"`ls {path.parent}` lists names" if os.path.isdir(path.parent) else f"there is no folder {path.parent}"
         hint = (absent and nearest_file_question(path)) or f"correct the path: {hint}"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from None
     if not readable:
         hint = f"allow reading by `chmod u+r {path}`, or copy the file to a folder of your own"
         raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
@@ -97,7 +97,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         reason = os_error_reason(error) if isinstance(error, OSError) else "it is not UTF-8 text"
         hint = "copy it again from its source" if isinstance(error, OSError) else "save it again as UTF-8 text"
         what, allowed = f"the file cannot be read ({reason})", "readable text in UTF-8"
-        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from error
+        raise DataError(what, where=str(path), allowed=allowed, hint=hint) from None
 
 
 def read_input_json(path: Path) -> Any:
@@ -107,7 +107,7 @@ def read_input_json(path: Path) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         what, hint = f"the file is not valid JSON ({error})", "correct this place, or copy the file from its source"
-        raise DataError(what, where=str(path), allowed="a JSON file", hint=hint) from error
+        raise DataError(what, where=str(path), allowed="a JSON file", hint=hint) from None
 
 
 @contextlib.contextmanager

@@ -1,10 +1,14 @@
 """What a user gets wrong: exit code 2, a message that says what, where, what is allowed, what to do; nothing left."""
 
+import traceback
 from operator import delitem, setitem
 
 import h5py
 import numpy as np
 import pytest
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.errors import ConfigError
 
 
 def assert_refused(done, *words):
@@ -85,6 +89,10 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 def test_no_such_configuration(cli, pendulum):
     folder = pendulum.parent
     assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
+    with pytest.raises(ConfigError) as caught:
+        load_config(folder / "pendolum.yaml")
+    said = "".join(traceback.format_exception(caught.value))
+    assert said.count("Traceback") == 1, said
     assert_refused(cli("solve", folder / "x.h5"), "x.h5 is a recording, not a configuration", "init ROBOT.urdf")
     assert_refused(cli("check", folder), "this is a folder, but must be a file", "a YAML file")
     for text, words in ((b"- 1\n", "but no keys"), (b"description: \xe9\n", "UTF-8")):

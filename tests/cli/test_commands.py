@@ -54,6 +54,16 @@ def test_a_solve_waits_for_no_library_that_it_does_not_run():
     assert done.stdout.strip() == "[]"
 
 
+def test_the_help_has_the_groups_of_the_readme(cli, repository):
+    readme = (repository / "README.md").read_text("utf-8").partition("## Commands")[2].partition("`yid-ocp COMMAND")[0]
+    groups = re.findall(r"- \*\*(.*?):\*\*(.*?)(?=\n- |\Z)", readme, re.S)
+    said = {
+        name.lower(): re.findall("`([a-z]+)`", re.sub(r"\(\[.*?\)\)?", "", text, flags=re.S)) for name, text in groups
+    }
+    found = re.findall(r"\n  (\w[\w ]+):\n(.*?)(?=\n\n)", cli("--help").out, re.S)
+    assert said == {name: re.findall(r"^    (\w+)", text, re.M) for name, text in found}
+
+
 def test_every_command_is_a_function_of_workflow_and_prints_json():
     for row in COMMANDS:
         if isinstance(row.run, str):

@@ -126,6 +126,7 @@ def test_bag_order_and_sets_of_joints_may_change(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START + SECOND, second)])
     assert np.array_equal(joints_of(read_any(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
     assert np.array_equal(np.sort(joints_of(read_any(path)).position), [[1, 2], [3, 4]])
+    assert read_any(path, joints=["*=arm_*"]).joint_names == ("arm_a", "arm_b")
     gripper = joint_state(("finger",), START, position=[0.5])
     (tmp_path / "other").mkdir()
     path = write_bag(tmp_path / "other", "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])

@@ -76,6 +76,8 @@ def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
     path = table(tmp_path, "t,q_a,q_b,x:m1,y:m1,z:m1,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
+    assert read_any(path, joints=["*=arm_*"]).joint_names == ("arm_a", "arm_b")
+    refused(path, "there is no joint 'j[*]'", joints=["j*=arm_*"])
     recording = read_any(path, joints=["b=elbow"], point_names={"m2": "cable:100%"})
     assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
     assert (joints_of(recording).position[0, 0], recording.points[0].position[0, 0, 0]) == (2, 4)
@@ -134,6 +136,7 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "meaning without kind": (GOOD, {"column_meanings": {"q_a": "angle:a"}}, "'angle:a' of", "q_a=position:a'"),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cell,", ""),
     "decimal commas": ("t,q_a\n0,0,1,5\n", {}, "the row has 4 cells", "decimal commas need semicolons"),
+    "marks of two rows": ("t;q_a\n0.1;999.5\n0.2;1,234\n", {}, "numbers with commas and numbers with points", ""),
     "both marks": ("t;q_a;q_b\n0;0.1;1,234\n", {}, "numbers with commas and numbers with points", ""),
     "time of day": ("t,q_a\n10:20:30,1\n", {}, "the cell '10:20:30' in column 't' is not a number", ""),
     "no such day": ("t,q_a\n2025-13-04T10:20:30,1\n", {}, "the cell '2025-13-04T10:20:30' in column 't'", ""),
@@ -318,6 +321,7 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         ("t,lift.q_mm,lift.qd_mm_s,lift.F_N", "t position:lift velocity:lift effort:lift"),
         ("t,tip X,tip Y,tip Z", "t x:tip y:tip z:tip"),
         ("t,tip_x [mm],tip_y [mm],tip_z [mm]", "t x:tip y:tip z:tip"),
+        ("time [ms],yaw_deg,lift_rad,heat_s", "t position:yaw position:lift None"),
         ("t,x,y,z", "t x:marker y:marker z:marker"),
         ("frame,tip_qw,j0", "None None None"),
     ],

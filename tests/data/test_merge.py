@@ -87,6 +87,7 @@ def test_what_cannot_be_aligned_is_refused() -> None:
     for joints, t, what in (
         (JointGroup(("a",), T[:20] / 10, wander(T[:20], 0)[:, :1]), FRAMES + 1e9, "do not overlap"),
         (ROBOT.joints, 1e3 * FRAMES, "2 of 1900 samples of camera"),  # milliseconds
+        (ROBOT.joints, 1e-3 * FRAMES, "samples of camera would be 1e-05 s apart"),  # seconds read as milliseconds
         (replace(ROBOT.joints, t=1e9 * (1.7e9 + T)), FRAMES, "4000 samples of robot .*, so its times seem to be in ns"),
     ):
         with pytest.raises(DataError, match=what):

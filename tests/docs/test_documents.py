@@ -160,13 +160,19 @@ def test_the_script_of_the_inspection_runs(page, repository, monkeypatch, capsys
     assert "d del[T1_0_x] / d T1.bend = -h/2*0.5*(q0[T1_0_x] + q1[T1_0_x])" in capsys.readouterr().out
 
 
-def test_the_worked_example_of_an_effect_runs(page, run_script, tmp_path):
-    named = re.findall(r"```python ?(\S*)\n(.*?)```", page("extending"), re.DOTALL)
-    assert named[0][0] == "churning.py"
+@pytest.mark.parametrize(
+    ("name", "first"), [("extending", "churning.py"), ("own_object", "strip.py"), ("own_sensor", "passive_angles.py")]
+)
+def test_the_worked_example_of_an_extension_runs(page, run_script, tmp_path, name, first):
+    named = re.findall(r"```python ?(\S*)\n(.*?)```", page(name), re.DOTALL)
+    assert named[0][0] == first
     for name, block in named:
         if name:
             (tmp_path / name).write_text(block, encoding="utf-8")
     run_script("\n".join(block for name, block in named if not name), tmp_path)
+
+
+def test_the_effect_of_the_page_is_used_like_any_other(page):
     [block] = blocks(page("extending"), "yaml")
     [entry] = YAML(typ="safe", pure=True).load(block)["model"]["effects"]
     said = EffectSettings(**entry)

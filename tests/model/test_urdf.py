@@ -226,8 +226,12 @@ def test_moments_that_no_body_has_are_said(tmp_path, caplog, monkeypatch):
     assert "robot.urdf: link 'tip' has principal moments" in caplog.text
     assert len({*caplog.messages}) == 1
     caplog.clear()
-    read_urdf(urdf(tmp_path, *with_tip(moments=(1, 2, 3))))
+    path = urdf(tmp_path, *with_tip(moments=(1, 2, 3)))
+    read_urdf(path)
     assert caplog.text == ""
+    path.write_text(path.read_text().replace('<mass value="1', '<mass value="0" was="1'))
+    read_urdf(path)
+    assert "robot.urdf: link 'tip' has moments of inertia, but no mass. They are not used" in caplog.text
 
 
 def follower(tmp_path, following="first"):

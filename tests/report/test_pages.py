@@ -366,6 +366,16 @@ def test_a_browser_draws_the_picture_of_a_guess(printed, pendulum_data, urdf_fol
         check_in_browser(tmp_path / "run.html", *look, tmp_path)
 
 
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["batch", "blind"])
+def test_a_browser_draws_the_page_of_many_runs(command, printed, pendulum, repository, tmp_path):
+    slices = repository / "benchmarks" / "blind_slices" / "seed_63017.json"
+    printed(command, *([pendulum] if command == "batch" else ["--join", slices]), "--out", "many")
+    for look in LOOKS:
+        check_in_browser(tmp_path / "many" / "report.html", *look, tmp_path)
+
+
 def assert_same_words(out: str, page: str) -> None:
     """Every sentence and cell of a terminal stands on the page."""
     *lines, _ = out.splitlines()  # the last one is the folder

@@ -5,12 +5,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 from made_cross import URDF
+from made_lerobot import lerobot_dataset
 from ruamel.yaml import YAML
 
 from yid_ocp.cli import main
@@ -283,7 +283,7 @@ def test_efforts_beside_points_are_left_alone(bench: Path, capsys: pytest.Captur
     known = proposed(replace(stated, joints=replace(stated.joints, effort_bias_std=0.2)))
     assert known.sensors["joints.effort"].bias_std is None
     text = Path("run.yaml").read_text()
-    assert (known.model.damping["pitch"], "friction of the URDF, {pitch: 0.8}" in text) == (0.4, True)
+    assert (known.model.damping["pitch"], "friction of the robot file, {pitch: 0.8}" in text) == (0.4, True)
     assert proposed(moved(SHORT, parts=(), effort=True)).parameters["pitch.damping"].initial == 0.4
     assert "0.4 N m s/rad  of pitch, as the robot file states" in (told := capsys.readouterr().out)
     assert told.count("find friction and payload of the arm too, set sensors.joints.effort.use: true") == 2
@@ -321,24 +321,6 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     for changes in ({"position_command": made.joints.position}, {"effort": np.ones_like(commands)}):
         other = replace(made.joints, **{"position_command": commands, **changes})
         assert proposed(replace(made, joints=other)).model.arms.mode == "prescribed"
-
-
-def lerobot_dataset(folder: Path, joints: JointGroup) -> Path:
-    """A dataset of one episode as LeRobot makes it: angles in degrees as 32-bit numbers, the gripper in per cent."""
-    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install '.[lerobot]'")
-    from pyarrow import parquet
-
-    shape = {"dtype": "float32", "shape": [6], "names": [f"{name}.pos" for name in joints.names]}
-    info = {"codebase_version": "v3.0", "fps": 50, "features": {"action": shape, "observation.state": shape}}
-    (folder / "meta").mkdir(parents=True)
-    (folder / "meta" / "info.json").write_text(json.dumps(info | {"total_episodes": 1, "robot_type": "so101_follower"}))
-    (folder / "data" / "chunk-000").mkdir(parents=True)
-    both = {"observation.state": joints.position, "action": joints.position_command}
-    turned = {name: np.degrees(x).astype(np.float32) for name, x in both.items()}
-    columns: dict[str, Any] = {name: np.hstack([x[:, :5], 50 + 0 * x[:, 5:]]).tolist() for name, x in turned.items()}
-    columns |= {"frame_index": list(range(len(joints.t))), "episode_index": [0] * len(joints.t)}
-    parquet.write_table(pyarrow.table(columns), folder / "data" / "chunk-000" / "file-000.parquet")
-    return folder
 
 
 def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, repository: Path) -> None:
@@ -550,6 +532,8 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
     write_recording(moved(SHORT), bench / "one.h5")
     assert "the recording lacks the joint 'pitch', which one has" in refusal("one.h5", "bag.csv")
     assert not (bench / "bag.h5").exists()
+    (bench / "tip.csv").write_text("t,tip_x,tip_y,tip_z\n0,1,1,1\n1,1,1,2\n")
+    assert "yid-ocp import one.h5 tip.csv --out one_merged.h5" in refusal("one.h5", "tip.csv")
     roll = moved(SHORT)
     roll = replace(roll, joints=JointGroup(("roll",), SHORT, roll.joints.position[:, :1]))
     write_recording(roll, bench / "roll.h5")
@@ -561,7 +545,19 @@ def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.Capt
 
 def test_a_recording_of_one_sample_is_doubted(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     proposed(moved(SHORT[:1]))
-    assert "joints has only 1 sample (at least 4 are needed)" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "joints has only 1 sample (at least 4 are needed)" in told
+    assert ("do not use it before the advice above is followed" in told, "yid-ocp check" in told) == (True, False)
+    made = moved(1e3 * SHORT, parts=())
+    made = replace(made, joints=replace(made.joints, effort=made.joints.position))
+    proposed(made, "--holder", "hub")
+    assert "try: import the original file again with --units t=ms, and give the" in capsys.readouterr().out
+    rows = "".join(f"{t},{a},{a},{a},{a}\n" for t, a in zip(made.joints.t, made.joints.position[:, 0], strict=True))
+    Path("ms.csv").write_text("t,q_roll,q_pitch,tau_roll,tau_pitch\n" + rows)
+    assert init("--replace", files=["ms.csv"]) == 0
+    assert "try: repeat this command with --units t=ms --replace" in capsys.readouterr().out
+    assert init("--units", "t=ms", "--replace", files=["ms.csv"]) == 0
+    assert "next: yid-ocp check run.yaml" in capsys.readouterr().out
 
 
 def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -84,11 +84,11 @@ def _read(path: Path) -> str:
         what, allowed, hint = error.what, "a YAML file in UTF-8 of at most 1 MiB", error.hint
         if path.is_dir():
             hint = f"use the path of a file, such as {min(path.glob('*.y*ml'), default=path / 'CONFIG.yaml')}"
-        if isinstance(error.__cause__, FileNotFoundError):
+        if isinstance(error.__context__, FileNotFoundError):
             what, allowed = "there is no such configuration file", "the path of an existing YAML file"
             init = "correct the path, or write a configuration: yid-ocp init ROBOT RECORDING --out CONFIG.yaml"
             hint = nearest_file_question(path, "*.y*ml") or init
-        raise ConfigError(what, where=str(path), allowed=allowed, hint=hint) from error
+        raise ConfigError(what, where=str(path), allowed=allowed, hint=hint) from None
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]:
@@ -146,11 +146,11 @@ def _loaded(text: str, origin: str) -> Any:
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
         allowed, hint = ("each key once in a section", "remove one of the two") if twice else (_ALLOWED_YAML, hint)
-        raise ConfigError(what, where=f"{origin}{line}", allowed=allowed, hint=hint) from error
-    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+        raise ConfigError(what, where=f"{origin}{line}", allowed=allowed, hint=hint) from None
+    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError):
         # errors of the YAML library on unusual text: numbers of thousands of digits, keys that are lists
         what, hint = "the file is not valid YAML", "remove numbers of over 4000 digits, and keys that are lists"
-        raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from error
+        raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from None
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
@@ -198,12 +198,12 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
     path, hint = _key_path(RunSettings, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
-    except ConfigError as error:
+    except ConfigError:
         spaced = re.sub(r":(?=\S)", ": ", value_text)
         what, hint = f"the value '{value_text[:80]}' is not valid YAML", "close brackets and quotation marks"
         if "{" in value_text and spaced != value_text:
             what, hint = f"{what}: a space is missing after a colon", f"write --set '{key.strip()}={spaced}'"
-        raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from error
+        raise ConfigError(what, where=origin, allowed="a number, text, [list], {key: value}", hint=hint) from None
     parent = data
     for i, part in enumerate(path[:-1]):
         entry = parent.get(part)
@@ -293,8 +293,8 @@ class _Reader:
             text = json.dumps(raw)
             json.loads(text, parse_constant=_refuse_nan)
             value = _adapter(hint).validate_json(text, strict=True)
-        except (ValidationError, TypeError, ValueError) as error:
-            raise self._wrong(raw, hint, path, default) from error
+        except (ValidationError, TypeError, ValueError):
+            raise self._wrong(raw, hint, path, default) from None
         return _absolute(value, hint, self.base)
 
     def _section(self, sections: schema.SectionVariants, raw: Any, path: _KeyPath) -> Any:

@@ -58,8 +58,11 @@ def _split_unit(column: str, sensor_components: Sequence[str]) -> tuple[str, str
             return name if unit else "", unit
     if _exact_meaning(column, sensor_components) is None and (suffixed := _SUFFIXED_UNIT.fullmatch(column)):
         name = suffixed[1]
+        unit = UNIT_BY_WORD[suffixed[2].lower()]
         if _exact_meaning(name, sensor_components) or _spelled_meaning(name):
-            return name, UNIT_BY_WORD[suffixed[2].lower()]
+            return name, unit
+        if unit in ("deg", "rad"):
+            return f"q_{name}", unit  # the angle of the joint of this name
     return column, ""
 
 
@@ -107,8 +110,7 @@ def _joint_force(column: str, known: Sequence[ColumnMeaning]) -> ColumnMeaning:
 _Rows = Iterable[tuple[int, list[str]]]
 _VICON_SECTIONS = ("Trajectories", "Devices", "Model Outputs", "Joints", "Segments")
 _UNITS = {"mm": "mm", "millimeters": "mm", "cm": "cm", "centimeters": "cm", "m": "m", "meters": "m"}
-_MocapTable = tuple[PointGroup, str, tuple[str, ...]]
-"""Points of a motion capture export in its own unit, this unit (mm, cm or m), and notes for the user."""
+_MocapTable = tuple[PointGroup, str, tuple[str, ...]]  # points in the file's own unit, this unit, notes for the user
 
 
 def select_mocap_table_reader(first_row: Sequence[str]) -> Callable[[_Rows, str], _MocapTable] | None:

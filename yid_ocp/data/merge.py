@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ _MIN_SAID_LAG = 0.02  # [s]
 _MAX_GRID, _MAX_BRIDGED = 20000, 0.1  # samples of the search of lags; gap of points that it bridges [s]
 _MIN_TURN, _MIN_TRAVEL, _MIN_SAMPLES, _MIN_SEEN_FRACTION = 0.05, 0.005, 20, 0.5  # [rad], [m]
 _ALIGNED_CLOCK_STD = 0.03  # of an offset that the motion tells, which an object that swings behind shifts [s]
+_LEAST_PERIOD = 5e-5  # of a sensor [s]; a camera whose seconds are read as milliseconds has less
 _LARGEST_START = 1e6  # larger times are counted from the first sample [s]
 
 
@@ -95,7 +97,7 @@ def _shift(first: Recording, other: Recording) -> tuple[float, str]:
     (begin, end), (start, stop) = _span(first), _span(other)
     overlap, shortest = min(end, stop) - max(begin, start), min(end - begin, stop - start)
     shared = overlap >= _MIN_SHARED_FRACTION * shortest
-    for recording in (first, other):
+    for recording in sorted((first, other), key=_least_period):
         _check_time_unit(recording, shortest, default="ms" if shared else "")
     part = f"their times overlap by {overlap:.4g} of {max(end - begin, stop - start):.4g} s"
     said = f"{first.name} and {other.name} are assumed to have one clock ({part})"
@@ -128,14 +130,22 @@ def _late_points(first: Recording, other: Recording, name: str, applied: float) 
     return f"{said}clock, import again with this option (--clock-offset {name}={round(applied - best.lag, 3):.12g})"
 
 
+def _least_period(recording: Recording) -> float:
+    return min(median_sample_period(group.t) or math.inf for group in recording.all_groups)
+
+
 def _check_time_unit(recording: Recording, duration: float, default: str) -> None:
     """Raise `DataError` if hardly any of many samples lies in `duration` [s] and the unit shows or has a `default`."""
     name, unit = recording.name, guess_non_si_units(recording)[0].get("t", default)
     total = max(len(group.t) for group in recording.all_groups)
     inside = max(np.count_nonzero(group.t - group.t[0] <= duration) for group in recording.all_groups)
-    if unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples:
+    is_too_fast = (period := _least_period(recording)) < _LEAST_PERIOD
+    if is_too_fast or (unit and total >= _MIN_SAMPLES and inside < QUALITY_LIMITS.min_samples):
         what = f"only {inside} of {total} samples of {name} lie in {duration:.4g} s, so its times seem to be in {unit}"
         hint = f"import {name} alone with --units t={unit}, and list its .h5 in its place"
+        if is_too_fast:
+            what = f"the samples of {name} would be {period:.3g} s apart, so its times seem to have another unit"
+            hint = f"import {name} alone, without a unit of t or with the right one, and list its .h5 in its place"
         raise DataError(what, where=name, allowed="files of one run with one unit of time", hint=hint)
 
 

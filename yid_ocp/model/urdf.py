@@ -400,6 +400,8 @@ def _walk(
         link, carrier, at, parent = stack.pop()
         frames[link] = (carrier, at, parent)
         inertial = links[link]
+        if inertial is not None and carrier is not None and not inertial.mass and inertial.inertia.any():
+            log.warning("%s: link '%s' has moments of inertia, but no mass. They are not used", Path(where).name, link)
         if inertial is not None and inertial.mass:
             if carrier is not None:
                 _check_bodies(link, inertial.inertia, where)

@@ -27,8 +27,7 @@ _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link
 """Usual names of the frame at the end of an arm, most likely first."""
 _MAX_TIME_STEP = 0.01  # default largest time step of the integrator [s]
 _SLOW_SAMPLE_PERIOD = 0.05  # samples farther apart than this do not show their noise, because the motion is as fast [s]
-_CAMERA_STD, _MARKER_STD = 5e-3, 1e-3
-"""Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
+_CAMERA_STD, _MARKER_STD = 5e-3, 1e-3  # of points of slow and of fast sensors whose noise the data do not show [m]
 _MAX_RIGID_MOTION = 1e-3  # std of a marker in the frame of the gripper to which it is fixed [m]
 _MIN_AXIS_DISTANCE = 0.01  # distance of a marker on the gripper from the axis of the object [m]
 _MAX_COMMON_NOISE_RATIO = 2.0  # of the largest noise of joints that get one number, over the smallest
@@ -58,8 +57,7 @@ _MAX_LATENESS = 0.25  # largest lateness of the points' clock, for which the hol
 _MAX_STRAIGHT_DEVIATION = 0.01  # of the length; largest deviation of a straight segment's end distance from its length
 _STRAIGHTEST_FRACTION = 0.1  # fraction of the samples with the end farthest from the holder
 _SEEN_NOISE, _STATED_NOISE = "estimated from differences of consecutive samples", "as the recording states"
-_LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
-"""Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
+_LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}  # motor and LeRobot's gain, by start of name
 
 
 @dataclass(frozen=True)
@@ -214,11 +212,7 @@ def propose_config_choices(
 
 
 def _recorded_urdf_joints(robot: str, whole: Mechanism, recordings: Sequence[Recording]) -> list[str]:
-    """Joints of the URDF that the first recording has. Raises `ConfigError` if it has none or a recording no joints."""
-    for other in (recording for recording in recordings if recording.joints is None):
-        hint = f"merge it with the joints of its run: yid-ocp import JOINTS {other.name}... --out RUN.h5"
-        what, allowed = f"recording '{other.name}' has no joint angles", "a recording with joint states of the robot"
-        raise ConfigError(what, where=f"recording '{other.name}'", allowed=allowed, hint=hint)
+    """Joints of the URDF that the first recording has. Raises `ConfigError` if there are none."""
     if not whole.joint_names:
         what, hint = "the robot has no joint that can move", "give the URDF or MJCF file of the whole robot"
         raise ConfigError(what, where=robot, allowed="revolute, continuous or prismatic joints", hint=hint)
@@ -398,7 +392,7 @@ def _places(
             parts = _parts_when_straight(positions, poses, branches)
         for i, point in enumerate(group.names):
             owner, colon, part = point.partition(":")
-            frame, reason, std = "", "its place on the model is not known", 0.0
+            frame, reason, std = "", "the place on the model is not known", 0.0
             beside: tuple[float, ...] = ()
             if point in frames or (colon and owner in names and part.endswith("%")):
                 frame, reason = point, "their names are equal"
@@ -407,7 +401,7 @@ def _places(
             elif not standing:
                 straight = math.nan if parts is None else float(parts[i])
                 if beside := _place_beside_object(poses, positions[:, i], branches, axis):
-                    frame, reason = holder, f"it moves with {holder}, and is not on the object"
+                    frame, reason = holder, f"the position relative to {holder} is constant, and is not on the object"
                 else:
                     frame, reason = _near(poses, positions[:, i], straight, branches, holder)
                 if frame and len(branches) == 1:
@@ -482,7 +476,7 @@ def _near(
     """Return the most probable frame of a point (empty if unknown), from its distance to the holder, and the reason."""
     seen = np.isfinite(position).all(axis=1)
     if not seen.any():
-        return "", "it was never seen"
+        return "", "no sample has a position"
     poses = poses[seen]
     from_holder = position[seen] - poses[:, :3, 3]
     if len(branches) == 1:

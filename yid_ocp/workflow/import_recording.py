@@ -25,6 +25,8 @@ from yid_ocp.sensors import SensorOptions
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
+_AGAIN = "repeat this command with --units {}"
+DO_NOT_USE = "{} has the values as read: do not use it before the advice above is followed"
 _LISTS = ("joint_topics", "joints")
 _KINDS = {name: mapping_value_type(entry.type_hint) for name, entry in class_options_by_key(ImportSettings).items()}
 _MAPPINGS = {name: kind for name, kind in _KINDS.items() if kind is not None and name != "units"}
@@ -62,8 +64,7 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
     then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml (name all recordings and the object: yid-ocp init "
     then += f"--help). If there is a configuration already, add {out} to its recordings.estimate"
-    if is_severe:
-        then = f"{out} has the values as read: do not use it before the advice above is followed"
+    then = DO_NOT_USE.format(out) if is_severe else then
     lines = [*issues, *recording_summary_lines(recording), "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)
     return EXIT_DONE
@@ -126,12 +127,12 @@ def _proposal_lines(
         more = [f"  {word}: {text}" for word, text in (("allowed", error.allowed), ("try", error.hint)) if text]
         return ["", f"the import needs more information: {error.what}", *more], False
     what = "it" if len(files) == 1 else "them as one recording"
-    issues, command = recording_issue_lines(recording)[0], _import_command_line(files, options)
+    issues, command = recording_issue_lines(recording)[0], import_command_line(files, options)
     return ["", *issues, f"to import {what}:", f"  {command}"], True
 
 
-def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[list[str], bool]:
-    """Return lines about the issues of a recording that show without a model, and whether one of them is severe."""
+def recording_issue_lines(recording: Recording, again: str = _AGAIN) -> tuple[list[str], bool]:
+    """Return lines about issues that show without a model, and whether one is severe. `again` states the cure `{}`."""
     units, reasons = base.guess_non_si_units(recording)
     found = recording_quality_issues(recording, lambda group: SensorOptions())
     found = [issue for issue in found if not (issue.cause == "time_unit" and "t" in units)]
@@ -142,7 +143,7 @@ def recording_issue_lines(recording: Recording, more_flags: str = "") -> tuple[l
         told = (f"{kinds[own.severity]} ({own.certainty_word}): {own.what}\n" for own in alike)
         said.append(f"{''.join(told)}  try: {cure}")
     for (quantity, unit), reason in zip(units.items(), reasons, strict=True):
-        said.append(f"issue (likely): {reason}\n  try: repeat this command with --units {quantity}={unit}{more_flags}")
+        said.append(f"issue (likely): {reason}\n  try: {again.format(f'{quantity}={unit}')}")
     is_severe = bool(units) or any(own.severity != "warning" for own in found)
     return [*said, ""] if said else [], is_severe
 
@@ -251,7 +252,8 @@ def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
     return pairs
 
 
-def _import_command_line(files: Sequence[str], options: Mapping[str, Any]) -> str:
+def import_command_line(files: Sequence[str], options: Mapping[str, Any]) -> str:
+    """Return the command that imports the files as one recording with these options."""
     words = ["yid-ocp", "import", *map(str, files)]
     for key, value in options.items():
         if isinstance(value, bool):

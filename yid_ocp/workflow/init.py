@@ -62,6 +62,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
+    options = import_recording.reader_options_from_arguments(arguments)
+    lines, is_severe = _issue_lines(arguments.files, options, made.values(), recordings)
     segments, grasps = [] if item is None else item.settings.segment_definitions(), _grasps(arguments.grasp)
     asked = {"holder": arguments.holder, "grasps": grasps, "standing": item is not None and item.stands_in_world}
     proposal = propose_config_choices(robot, recordings, segments, **asked)
@@ -79,15 +81,13 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
-    options = import_recording.reader_options_from_arguments(arguments)
     about = f"{'An arm of position servos' if proposal.arm_mode == 'servo' else 'The arm'}, {where}, with a payload."
     about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
     _write(out, _config_text(where, about, item, proposal, files, options), written)
     result: dict[str, Any] = {"format": "yid-init/1", "configuration": str(out), "recordings": files}
     result["proposal"] = asdict(proposal)
     result["picture"] = _write_picture(out, _with_points_at_frames(recordings[0], proposal), result)
-    lines = [line for r in recordings for line in import_recording.recording_issue_lines(r, " --replace")[0] if line]
-    lines += _summary_lines(proposal, out, recordings, result["picture"] is not None)
+    lines += _summary_lines(proposal, out, recordings, result["picture"] is not None, is_severe)
     end = f"configuration: {out}{''.join(f', recording: {file}' for file in written)}"
     print_result(arguments, result, lambda: lines, end, str(out))
     return EXIT_DONE
@@ -168,6 +168,25 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
     return made
 
 
+def _issue_lines(
+    files: Sequence[str], options: Mapping[str, Any], new: Iterable[Recording | None], recordings: Sequence[Recording]
+) -> tuple[list[str], bool]:
+    """Lines on issues, and whether one is severe. `new` is not None for files of other tools. All must have joints."""
+    lines, is_severe = list[str](), False
+    joints = next((file for file, own in zip(files, recordings, strict=True) if own.joints is not None), "JOINTS")
+    for file, made, recording in zip(files, new, recordings, strict=True):
+        if recording.joints is None:
+            what, allowed = f"recording '{recording.name}' has no joint angles", "recordings with joint states"
+            command = import_recording.import_command_line([joints, file], options)
+            hint = f"merge it with the joints of its run, and give `init` the result: {command}"
+            raise ConfigError(what, where=file, allowed=allowed, hint=hint)
+        hint = "import the original file again with --units {}, and give the result in place of this one"
+        hint = hint if made is None else "repeat this command with --units {} --replace"
+        own, is_own_severe = import_recording.recording_issue_lines(recording, hint)
+        lines, is_severe = [*lines, *filter(None, own)], is_severe or is_own_severe
+    return lines, is_severe
+
+
 def _split(
     made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ProposedConfigChoices, out: Path
 ) -> dict[Path, Recording | None]:
@@ -202,7 +221,7 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
 
 
 def _summary_lines(
-    proposal: ProposedConfigChoices, out: Path, recordings: Sequence[Recording], has_picture: bool
+    proposal: ProposedConfigChoices, out: Path, recordings: Sequence[Recording], has_picture: bool, is_severe: bool
 ) -> list[str]:
     held = list(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     others = [frame for frame in proposal.arms[0].tool_frames if frame not in held][:8]
@@ -235,9 +254,9 @@ def _summary_lines(
     is_left_out = has_efforts and proposal.arm_mode == "prescribed" and not proposal.is_identified_from_efforts_only
     unseen = "Recorded torques are not used. To let `diagnose` find friction and payload of the arm too, set "
     lines += [f"{unseen}sensors.joints.effort.use: true."] * is_left_out
-    first = "follow the warnings, then " * bool(lost)
-    lines += ["", f"next: {first}yid-ocp check {quoted}, then yid-ocp solve {quoted}"]
-    if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1:
+    then = f"next: {'follow the warnings, then ' * bool(lost)}yid-ocp check {quoted}, then yid-ocp solve {quoted}"
+    lines += ["", import_recording.DO_NOT_USE.format(out) if is_severe else then]
+    if (has_efforts or proposal.arm_mode == "servo") and len(recordings) > 1 and not is_severe:
         more = " --set sensors.joints.effort.use=true" * is_left_out
         lines.append(f"to estimate the friction of the arm's joints: yid-ocp friction {quoted}{more}")
     return [*lines, ""]

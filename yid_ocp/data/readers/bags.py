@@ -403,7 +403,8 @@ def _joints(bag: _Contents, options: _BagOptions, where: str) -> tuple[list[_Sta
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_one_of(topic, known, "joint states")
     chosen = [topic for topic in (default if topics is None else topics) if topic != command]
-    wanted = None if options.joints is None else base.parse_old_to_new_joint_names(options.joints, where)
+    sent = dict.fromkeys(name for m in bag.states if m.source in chosen for name in m.content.name)
+    wanted = None if options.joints is None else base.parse_old_to_new_joint_names(options.joints, sent, where)
     found = []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -59,8 +60,7 @@ _TO_SI: Mapping[str, Mapping[str, float]] = {
 }
 MOTOR_CURRENT_UNITS = ("A", "mA")  # units of `effort` for motor currents
 _QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNEL_UNITS, "points": "m"}
-_MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
-"""Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
+_MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}  # [rad], [m]; larger: degrees, millimetres
 _MIN_LARGE_FRACTION = 0.01  # of the samples, which look like degrees; fewer large ones are wrong samples
 
 
@@ -108,12 +108,17 @@ def factor_to_si_by_quantity(units: Mapping[str, str], where: str) -> dict[str, 
     return factors
 
 
-def parse_old_to_new_joint_names(entries: Iterable[str], where: str) -> dict[str, str]:
-    """Return new joint names by recorded one, from `name` or `recorded=name`. `DataError` if empty or repeated."""
-    found: dict[str, str] = {}
+def parse_old_to_new_joint_names(entries: Iterable[str], known: Iterable[str], where: str) -> dict[str, str]:
+    """Return new names by `known` joint, from `name` or `recorded=name`; `*`: any text. `DataError` if not unique."""
+    pairs, found = list[tuple[str, str, str]](), dict[str, str]()
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
         name = name if equals else recorded
+        pattern = re.compile(re.escape(recorded).replace(r"\*", "(.*)", 1))
+        is_pattern = recorded.count("*") == name.count("*") == 1
+        matches = [own for own in map(pattern.fullmatch, known) if own] if is_pattern else []
+        pairs += [(entry, own[0], name.replace("*", own[1])) for own in matches] or [(entry, recorded, name)]
+    for entry, recorded, name in pairs:
         if not recorded or not name:
             allowed, hint = "NAME, or RECORDED=NAME of a joint", "write for example --joints q1=shoulder,q2=elbow"
             raise DataError(f"the entry '{entry}' lacks the name of a joint", where=where, allowed=allowed, hint=hint)
@@ -146,7 +151,7 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: JointPointAn
     if group is not None:
         names = {name: name for name in group.names}
         if options.joints is not None:
-            names = parse_old_to_new_joint_names(options.joints, where)
+            names = parse_old_to_new_joint_names(options.joints, group.names, where)
             require_known_names(names, group.names, "joint", f"--joints, {where}", DataError)
         at, recorded = [group.names.index(name) for name in names], group.values_by_channel.items()
         channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in recorded}

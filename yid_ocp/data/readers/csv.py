@@ -187,7 +187,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
             numbers.extend(map(_number, cells))
             blank.extend(cell.strip().lower() in ("", "nan") for cell in cells)
     if head and not numbers:  # every row has more or fewer cells: the error of reading the first one
-        _numbers(head[1], names, [None] * len(names), f"{path}, line {head[0]}")
+        _numbers(head[1], names, [None] * len(names), set(), f"{path}, line {head[0]}")
     table = np.array(numbers).reshape(-1, len(names))
     is_blank = np.array(blank, bool).reshape(table.shape)  # a sensor that has no sample in this row
     numeric = np.isfinite(table).sum(axis=0) > _MOST_BAD * (~is_blank).sum(axis=0)
@@ -293,7 +293,7 @@ def _read_table(
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
-    numbers, bad = array("d"), dict[int, str]()
+    numbers, bad, marks = array("d"), dict[int, str](), set[str]()
     columns = options.column_meanings or {}
     if not options.has_header:
         names = [str(i + 1) for i in range(len(first))]
@@ -305,7 +305,7 @@ def _read_table(
     units, scales = _units_and_scales([m for m in zip(meanings, own_units, strict=True) if m[0]], options, str(path))
     for line, cells in lines:
         try:
-            numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
+            numbers.extend(_numbers(cells, names, meanings, marks, f"{path}, line {line}"))
         except DataError as error:
             if not options.skip_bad_lines:
                 raise
@@ -365,7 +365,9 @@ def _parsed_number(cell: str) -> float:
     return float(np.datetime64(f"{date}T{clock.replace(',', '.')}", "ns").astype(float)) * 1e-9 - 60.0 * late
 
 
-def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], where: str) -> list[float]:
+def _numbers(
+    cells: Sequence[str], header: Sequence[str], meanings: Sequence[ColumnMeaning], marks: set[str], where: str
+) -> list[float]:
     if len(cells) != len(header):
         what = f"the row has {count_with_noun(len(cells), 'cell')}, but the header has {len(header)}"
         allowed = "as many as the header"
@@ -374,9 +376,11 @@ def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[Col
             hint += "; numbers with decimal commas need semicolons or tabs between the cells: export the table again"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     values = [cell for cell, meaning in zip(cells, meanings, strict=True) if meaning and meaning != ("t", "")]
-    if any("," in cell for cell in values) and any("." in cell for cell in values):
-        what, allowed = "the row has numbers with commas and numbers with points", "decimal commas or decimal points"
+    own = marks.union(mark for mark in ",." if any(mark in cell for cell in values))
+    if len(own) > 1:
+        what, allowed = "the table has numbers with commas and numbers with points", "decimal commas or decimal points"
         raise DataError(what, where=where, allowed=allowed, hint=f"export it without thousands separators{_OR_SKIP}")
+    marks |= own
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
         if meaning:
