@@ -297,6 +297,9 @@ def test_licence_and_citation(repository) -> None:
     citation = loaded(repository, "CITATION.cff")
     assert f'license = "{citation["license"]}"' in project
     assert f'version = "{citation["version"]}"' in project
+    entry = read(repository, "yid_ocp/data/defaults/citation.bib")
+    assert f"```bibtex\n{entry}```" in read(repository, "README.md")
+    assert f"version = {{{citation['version']}}}" in entry
     licence = read(repository, "LICENSE")
     assert "Version 2.0, January 2004" in licence
     assert "END OF TERMS AND CONDITIONS" in licence
