@@ -1,10 +1,11 @@
-"""Summaries of the results of `inspect` and `export`, for the terminal and the HTML report."""
+"""Summaries of the results of `inspect`, `export` and `track`, for the terminal and the HTML report."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, kind_of_part, names_by_kind_text
 from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.report.terminal import (
@@ -15,6 +16,7 @@ from yid_ocp.report.terminal import (
     SummaryTable,
     TableRows,
     bound_range_text,
+    issue_summary_blocks,
     next_steps_table,
     scale_and_unit_with_metres_as_mm,
     shown_unit,
@@ -159,3 +161,28 @@ def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Ite
     text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
     yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
     yield "Unreliable values may be the cause." if is_bad and unreliable else ""
+
+
+@SUMMARIES.register("yid-track/1")
+def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+    truth = result["truth_errors"]
+    heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
+    rows: TableRows = [("point", "images", "± [mm]", *heads)]
+    for name, entry in result["points"].items():
+        cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
+        rows.append((name, str(entry["frames"]), *cells))
+    yield from issue_summary_blocks(result)
+    used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
+    used += "recording.h5 has their points."
+    used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
+    yield SummaryStatement(result["refused"] or used, "verdict")
+    yield SummaryTable(rows, "Tracked points", is_key_table=True)
+    for why, n in result["dropped"].items():
+        of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
+        first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)
+        yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
+    yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
+    yield from (thing["text"] for thing in result["things"])
+    steps = {"estimate the parameters that the configuration frees": "solve --set 'recordings.estimate=[recording.h5]'"}
+    yield next_steps_table(result, {} if result["refused"] else steps)
