@@ -46,8 +46,7 @@ def solve(
     The steps are: the best fit of several starts (`fit_problem`); a refit without cable memory if the recordings do
     not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
     `problem.options.checked_discretisations`, which are added to the standard deviations. Verdicts are `not_trusted` if
-    clocks drift, or if a prediction without a model has a smaller error than the model. A search that does not converge
-    raises no error; see `status` and `message` of the solution. An unstable time step has the status `stalled`.
+    clocks drift, or if a prediction without a model has a smaller error than the model. An unstable step is `stalled`.
 
     Parameters
     ----------
@@ -57,6 +56,11 @@ def solve(
         Default: the initial unknowns of the problem. Raises `ConfigError` for another number, or beyond a bound.
     callback : callable, optional
         Receives every `Iterate`.
+
+    Returns
+    -------
+    Solution
+        Estimates in their own units. A search that does not converge raises no error: see `status` and `message`.
     """
     if isinstance(solver, str):
         what, allowed = f"the solver is the text '{solver}'", "a solver object, such as yid_ocp.GaussNewton()"

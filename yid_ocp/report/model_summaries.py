@@ -55,9 +55,8 @@ def _inspect_summary(result: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIt
         entry = result["parameters"][name]
         cells = (f"{entry['value']:.6g}", terminal.shown_unit(entry["unit"]), terminal.bound_range_text(entry, 6))
         rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
-    yield terminal.SummaryTable(
-        rows, "Parameters" if result["asked"] else "All parameters", is_page_only=is_formula_asked
-    )
+    title = "Parameters" if result["asked"] else "All parameters"
+    yield terminal.SummaryTable(rows, title, is_page_only=is_formula_asked)
     files = ", ".join(("linearisation.h5 (A and other derivatives of the state after a step)", *result["exported"]))
     yield f"The folder has equations.txt (all equations and their names), {files}, and sparsity.png (pattern of zeros)."
     step = "test whether the recordings determine free parameters"
@@ -127,9 +126,8 @@ def _export_summary(manifest: Mapping[str, Any]) -> terminal.SummaryBlockOrTextI
     yield terminal.SummaryTable(rows, "Parts of the model in the file")
     rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
     for name, entry in gate.get("channels", {}).items():
-        sizes = (
-            terminal.value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise")
-        )
+        errors = map(entry.__getitem__, ("before", "after", "noise"))
+        sizes = (terminal.value_text_and_display_unit(error, entry["unit"])[0] for error in errors)
         rows.append((name, *sizes, terminal.scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
     yield terminal.SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
 

@@ -134,7 +134,7 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
 
 
 def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
-    """Build the system that a configuration file describes. Errors are as in `load_config` and `build_system`."""
+    """Build the system of a configuration file. Raises `ConfigError`, `DataError` or `ModelError` for a fault in it."""
     return build_system(load_config(path, overrides))
 
 
