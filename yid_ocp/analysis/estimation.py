@@ -278,7 +278,7 @@ def prediction_errors_units_and_fit_rmse(
         cable = problem.options.cable_vertices
         for name in BASELINE_DESCRIPTIONS:
             outputs = ([_baselines(e, s, cable).get(name, s.value * np.nan) for s in e.measurements] for e in episodes)
-            guesses = [replace(own, predicted_outputs=made) for (own, _), made in zip(able, outputs, strict=True)]
+            guesses = [replace(own, predicted_outputs=(*made,)) for (own, _), made in zip(able, outputs, strict=True)]
             for channel, errors in rmse_unit_count_dicts_by_channel(guesses, episodes).items():
                 residuals[channel].setdefault("baselines", {})[name] = errors["rmse"]
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
