@@ -55,8 +55,9 @@ def test_methods_agree_on_what_the_data_inform(problem):
     ],
 )
 def test_a_start_beyond_a_bound_is_refused_by_name(problem, start, said):
-    with pytest.raises(ConfigError, match=re.escape(said)):
+    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
         estimation.solve(problem, initial_unknowns=start)
+    assert (caught.value.where, "parameters." in caught.value.hint) == ("initial_unknowns", False)
 
 
 def test_nothing_to_agree_on(repository, carried_out):

@@ -24,6 +24,7 @@ from yid_ocp.analysis.run_estimates import (
     nearby_positive_definite_covariance,
     pool_estimates_and_chi2,
 )
+from yid_ocp.inference.uncertainty import value_and_uncertainty_text
 from yid_ocp.model.servos_and_springs import ServoModelOptions
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, fit_problem
@@ -244,5 +245,5 @@ def test_the_command_says_which_law_a_real_servo_warrants(cli, repository, share
     assert f"friction: {{law: {result['warranted']}, joints: [joint]}}" in done.out
     assert result["laws"]["load"]["mean_error"] < result["laws"]["viscous"]["mean_error"]
     gain, use = result["laws"][result["warranted"]]["parameters"]["joint.servo_gain"], result["to_use"]
-    told = f"joint.servo_gain = {gain['value']:.4g} ± {gain['std']:.2g} N m/rad"
+    told = f"joint.servo_gain = {value_and_uncertainty_text(gain['value'], gain['std'], least_digits=2)} N m/rad"
     assert (told in use["values"], use["uncounted_errors"]) == (True, []), "± counts the error of the time step"

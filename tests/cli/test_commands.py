@@ -103,7 +103,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert abs(moved["time_step"]) < 0.01 * pendulum_data.truth[name]
         assert 0 < moved["std"] <= result["parameters"][name]["std"]
     assert done.out.count("Half the time step would") == 1
-    assert (set(channel), channel["unit"]) == ({"rmse", "unit", "n", "expected"}, "N m")
+    assert (set(channel), channel["unit"]) == ({"rmse", "unit", "n", "expected", "baselines"}, "N m")
     assert 0.005 < channel["rmse"] < 0.02
     held_out = result["held_out"][0]
     assert set(held_out) == {"recording", "rmse", "baselines", "expected"}

@@ -33,6 +33,16 @@ def solved(**changes) -> dict:
     } | changes  # fmt: skip
 
 
+def test_without_held_out_recordings_the_fit_is_compared_with_noise_and_a_guess():
+    errors = {"p.a": {"rmse": 2e-3, "expected": 1e-3, "baselines": {"stays": 0.02}, "unit": "m", "n": 9}}
+    errors["p.b"] = errors["p.a"] | {"rmse": 1e-3}
+    lines = told("yid-solve/1", solved(residuals=errors))
+    assert line_of(lines, "p.a").split() == ["p.a", "2", "1", "20", "mm", "9"]
+    assert "on fitted recordings is at most 2 times that of noise alone and 10 % of that without" in " ".join(lines)
+    entry = {"recording": "r", "rmse": {"p.a": 2e-3}, "baselines": {}}
+    assert "at most 2 times" not in " ".join(told("yid-solve/1", solved(residuals=errors, held_out=[entry])))
+
+
 def compared(**changes) -> dict:
     return {
         "methods": {"gauss_newton": solved()}, "reference": "gauss_newton", "published": {}, "truth": {},

@@ -160,8 +160,14 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     folder_of(tmp_path / "old")
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline_run_folders=[old]",))
-    with pytest.raises(ConfigError, match=r"model\.object\.\w+\.beam\.links is 3 instead of 2"):
+    differs = r"has model\.object\.\w+\.beam\.links: 2, \S*old has model\.object\.\w+\.beam\.links: 3"
+    with pytest.raises(ConfigError, match=f"this configuration {differs}"):
         run_history.estimates_of_each_baseline_run(run)
+    (tmp_path / "run.yaml").write_text(BEAM.replace("model:", "model:\n  robot: package:baxter"), encoding="utf-8")
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "run.yaml").rename(tmp_path / "arm" / "config.yaml")
+    with pytest.raises(ConfigError, match=r"old has no model\.robot, \S*arm has model\.robot: package:baxter"):
+        run_history.require_runs_of_one_model([tmp_path / "old", tmp_path / "arm"])
 
 
 def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):

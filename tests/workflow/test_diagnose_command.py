@@ -355,7 +355,9 @@ def test_what_is_found_is_told_as_text_that_a_configuration_takes(rubbing, whole
     assert "sign_smoothing_speed: 0.003" in law["to_use"]["yaml"][1]
     fit = law["laws"][law["warranted"]]["parameters"]
     assert law["friction_parameters"] == [name for name in fit if name != "shoulder.stiffness"]
-    first_screen = (tmp_path / "law" / "report.html").read_text("utf-8").partition('id="scene"')[0]
+    page = (tmp_path / "law" / "report.html").read_text("utf-8")
+    assert "<h3>To use these numbers</h3>" in page.partition('id="numbers"')[2]
+    first_screen = page.partition('id="scene"')[0]
     shown = value_and_uncertainty_text(fit["elbow.damping"]["value"], fit["elbow.damping"]["std"])
     assert shown in first_screen
     assert shown in done.out

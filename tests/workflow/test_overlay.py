@@ -74,9 +74,9 @@ def test_a_value_that_cannot_be_found_has_no_digits_and_no_difference():
     assert (parameters["k"]["difference"], parameters["k"]["difference_in_std"]) == (None, None)
     channel = {"recording": "r", "channel": "points.p", "unit": "m", "held_out": True, "rmse": {"a": 1.0, "b": 2.0}}
     result = {"format": "yid-overlay/1", "runs": {"a": "a", "b": "b"}, "parameters": parameters}
-    result |= {"channels": [channel | {"difference": 0.5}], "model_difference": "object", "poor": ["b"]}
+    result |= {"channels": [channel | {"difference": 0.5}], "model_difference": "a has no model.object", "poor": ["b"]}
     lines = summary_terminal_lines(summary_blocks(result))
     assert "k          –  2.5 ± 0.1  N m/rad" in lines
     assert "No parameter can be compared" in lines[0]
     assert "The model did not explain the recordings of b." in " ".join(lines)
-    assert "The models differ (model.object), so a parameter may differ" in " ".join(lines)
+    assert "The models differ (a has no model.object), so a parameter may differ" in " ".join(lines)

@@ -24,7 +24,7 @@ from yid_ocp.model.servos_and_springs import StiffnessAndRest
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.report.summaries import _noise_cells
-from yid_ocp.report.terminal import copyable_estimates_blocks, torque_offset_table
+from yid_ocp.report.terminal import copyable_estimates_blocks, summary_terminal_lines, torque_offset_table
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.check import _fine_time_step, _input_noise, _too_stiff_start_warnings
@@ -293,19 +293,21 @@ def test_what_a_reader_copies_is_of_found_parameters_and_of_single_joints():
     found = {"T1.bend": (22.0, 0.5, "N m/rad", "identifiable")} | lost
     told, rough = (copied(system, {"T1.bend": 22.0}, errors, **found) for errors in ((), ["of the time step"]))
     assert told["values"] == rough["values"] == ["T1.bend = 22 ± 0.5 N m/rad"]
-    ignored, stated, _, lacking, *_ = copyable_estimates_blocks({"to_use": rough})
+    stated, ignored, lacking, *_ = copyable_estimates_blocks({"to_use": rough, "format": "yid-solve/1"})
+    assert summary_terminal_lines([stated])[::3] == ["To use these numbers:", "T1.bend = 22 ± 0.5 N m/rad"]
     assert "leaves out the error of the time step." in ignored
     assert "not known well enough: T1.twist." in lacking
     zero = {"T3.bend": (0.01, 0.2, "N m/rad", "identifiable")}
     blocks = [*copyable_estimates_blocks({"to_use": copied(system, {"T1.bend": 22.0}, **found, **zero)})]
     assert "do not differ from zero by more than two ±: T3.bend." in " ".join(b for b in blocks if isinstance(b, str))
     assert "T3.bend = " not in str(blocks)
-    assert stated not in copyable_estimates_blocks({"to_use": rough, "format": "yid-solve/1"}), "its table has them"
     assert told["joints"] == [{"segment": "T1", "deformation": "bend", "links": 4, "lowest": 22.0, "highest": 22.0}]
     assert told["yaml"] == ["parameters:", "  T1.bend: {free: true, initial: 22}"]
     assert told["mjcf"][0].startswith('<joint stiffness="22" damping="0.05"/> <!-- T1 bend, 4 links; for n links, mult')
     assert told["latex"] == [r"T1.bend & $22 \pm 0.5$ & N m/rad \\"]
     assert (told["export"], told["uncounted_errors"]) == ("yid-ocp export 'my runs/a'", [])
+    digits = copied(system, {}, (), **{"T1.bend": (10.6344, 0.0741, "1", "identifiable")})
+    assert (digits["values"], r"$10.634 \pm 0.074$" in digits["latex"][0]) == (["T1.bend = 10.634 ± 0.074"], True)
     small = copied(system, {}, (), **{"T1.bend": (2.2e-5, 5e-7, "1", "identifiable")})
     assert small["latex"] == [r"T1.bend & $2.2 \cdot 10^{-5} \pm 5 \cdot 10^{-7}$ & 1 \\"]
     assert small["values"] == ["T1.bend = 2.2e-05 ± 5e-07"]

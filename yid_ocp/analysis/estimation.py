@@ -55,8 +55,7 @@ def solve(
     The steps are: the best fit of several starts (`fit_problem`); a refit without cable memory if the recordings do
     not support it; profile-likelihood intervals of weakly determined parameters; the errors of the discretisations in
     `problem.options.checked_discretisations`, which are added to the standard deviations. Verdicts are `not_trusted` if
-    clocks drift, or if a prediction without a model has a smaller error than the model. A search that does not converge
-    raises no error; see `status` and `message` of the solution. An unstable time step has the status `stalled`.
+    clocks drift, or if a prediction without a model has a smaller error than the model. An unstable step is `stalled`.
 
     Parameters
     ----------
@@ -66,6 +65,11 @@ def solve(
         Default: the initial unknowns of the problem. Raises `ConfigError` for another number, or beyond a bound.
     callback : callable, optional
         Receives every `Iterate`.
+
+    Returns
+    -------
+    Solution
+        Estimates in their own units. A search that does not converge raises no error: see `status` and `message`.
     """
     if not isinstance(problem, EstimationProblem):
         what, hint = f"the problem is {problem!r}", "build it with yid_ocp.load_problem(CONFIG.yaml)"
@@ -274,14 +278,21 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
 def prediction_errors_units_and_fit_rmse(
     problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPredictionOrFailure]
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
-    """Return the prediction errors of every recording (held-out first), and by channel the units and fit errors."""
+    """Return prediction errors of every recording (held-out first), units by channel, and fit errors with baselines."""
     residuals: Mapping[str, Any] = {}
     pairs = list(held_out)
     if solution.evaluation is not None:
         fitted = list(zip(problem.episodes, solution.episode_predictions, strict=True))
         able = [(result, episode) for episode, result in fitted if not isinstance(result, str)]
-        residuals = rmse_unit_count_dicts_by_channel([result for result, _ in able], [episode for _, episode in able])
+        episodes = [episode for _, episode in able]
+        residuals = rmse_unit_count_dicts_by_channel([result for result, _ in able], episodes)
         pairs += fitted
+        cable = problem.options.cable_vertices
+        for name in BASELINE_DESCRIPTIONS:
+            outputs = ([_baselines(e, s, cable).get(name, s.value * np.nan) for s in e.measurements] for e in episodes)
+            guesses = [replace(own, predicted_outputs=(*made,)) for (own, _), made in zip(able, outputs, strict=True)]
+            for channel, errors in rmse_unit_count_dicts_by_channel(guesses, episodes).items():
+                residuals[channel].setdefault("baselines", {})[name] = errors["rmse"]
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
     return [_prediction_error_entry(problem, *pair) for pair in pairs], units, residuals
 

@@ -136,6 +136,11 @@ def identifiability(
         which are then also estimated; default: grasps are known.
     intervals : iterable of str, or "all"
         Parameters for which a profile-likelihood interval is computed.
+
+    Returns
+    -------
+    IdentifiabilityResult
+        Value, std and verdict of each of p parameters, in its unit; dimensionless correlations and information (p, p).
     """
     names = uncertainty.parameter_unknown_names(problem)
     chosen = (intervals,) if isinstance(intervals, str) else tuple(intervals)

@@ -124,6 +124,11 @@ def what_if(
         Names of changes to consider; default: all.
     evaluate_changes : callable, optional
         Replacement for the evaluation in this process, for example one that uses other processes.
+
+    Returns
+    -------
+    ExperimentChangesRankedByIdentifiability
+        Verdicts and relative standard deviations [1] for the unchanged experiment, each change, and the smallest sets.
     """
     x, inflation = unknown_vector_from_solution(problem, solution), 1.0
     if solution is not None:

@@ -31,7 +31,10 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     """The result of a diagnosis: verdict, gap, locations and effects, with the statistics behind them.
 
     Values have the units of their parameters. `smoother_result` has means and standard deviations (J, nd) per recording
-    of nd unknown forces [N m or N], offsets and biases [m] in J time intervals.
+    of nd unknown forces [N m or N], offsets and biases [m] in J time intervals. `law` is the law of the gap, or of the
+    part that effects leave. `events` are pushes and faults, compensated or excluded first. `next_steps` are texts.
+    `untried` names steps skipped because of `Thresholds.budget`, best first. The two values of
+    `stated_and_used_time_step` [s] differ if the stated step's error was part of the gap.
     """
 
     noise_floor: Mapping[str, float]  # rms error from noise alone by channel, in the channel's unit
@@ -50,13 +53,12 @@ class DiagnosisResult(ReprMixin, NominalModelGapEvidence, Judgement):
     summary: str = ""
     truncated_recordings: tuple[HeldOutTruncation, ...] = ()
     record: EffectSearchRecord = field(default_factory=EffectSearchRecord)
-    events: EventSet = NO_EVENTS  # events compensated or excluded before the rest was judged
-    untried: tuple[str, ...] = ()  # steps skipped because of `Thresholds.budget`, best first
-    # [s]; they differ if the stated step's error was part of the gap
+    events: EventSet = NO_EVENTS
+    untried: tuple[str, ...] = ()
     stated_and_used_time_step: tuple[float, float] = (0.0, 0.0)
     is_corrected_for_links: bool = False  # whether the data lack the error of the finite number of links
     errors_in_std: tuple[RefinementKind, ...] = ()  # of the discretisation, in the stds of the final model
-    law: NonparametricLaw | None = None  # law of the gap, or of the gap that the effects leave
+    law: NonparametricLaw | None = None
 
     def _summary(self) -> ReprTexts:
         closed = total_gap_closure(self.accepted_selected_effects).text

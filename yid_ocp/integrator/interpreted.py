@@ -16,21 +16,7 @@ import scipy.linalg.lapack
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.integrator.step_model import (
-    NEWTON_ITERATION_LIMIT,
-    CostDerivativesByRolloutOutputs,
-    NewtonStatusCode,
-    Rollout,
-    RolloutCostGradient,
-    RolloutInputs,
-    SensitivityDirections,
-    StepEquationsAndFunctions,
-    StepResidualsAndJacobians,
-    TrackingFeedback,
-    allocate_rollout,
-    allocate_step_linearizations,
-    attach_status_to_rollout,
-)
+from yid_ocp.integrator import step_model
 from yid_ocp.parallel import CasadiLockedCache
 
 _PointEvaluator = Callable[[Array], list[Array]]
@@ -43,7 +29,7 @@ class InterpretedKernel:
     point are the residuals of the balance, internal and constraint equations, then p1, then the prescribed efforts.
     """
 
-    def __init__(self, model: StepEquationsAndFunctions) -> None:
+    def __init__(self, model: step_model.StepEquationsAndFunctions) -> None:
         self._model = model
         self._functions: CasadiLockedCache[None, list[ca.Function]] = CasadiLockedCache(self._made)
         self._own = threading.local()
@@ -60,7 +46,7 @@ class InterpretedKernel:
         self._square = np.ix_(self._residual, self._unknown)
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
-    def make_kernel_sharing_code(self, model: StepEquationsAndFunctions) -> InterpretedKernel:
+    def make_kernel_sharing_code(self, model: step_model.StepEquationsAndFunctions) -> InterpretedKernel:
         """Create a kernel that reuses this kernel's functions for a `model` with the same equations."""
         other = InterpretedKernel(model)
         other._functions, other._own = self._functions, self._own
@@ -90,7 +76,7 @@ class InterpretedKernel:
 
     def _newton(
         self, value: _PointEvaluator, slope: _PointEvaluator, point: Array, by_work: bool
-    ) -> tuple[NewtonStatusCode, float, int]:
+    ) -> tuple[step_model.NewtonStatusCode, float, int]:
         """Solve for the unknowns in the point, by Newton's method with the line searches of kernel.c."""
 
         def largest(change: Array) -> float:
@@ -98,26 +84,26 @@ class InterpretedKernel:
 
         tolerance, error, balance = self._model.tolerance, math.inf, slice(self._coordinates - self._model.sizes["nz"])
         if not len(self._unknown):  # all coordinates are prescribed
-            return NewtonStatusCode.OK, 0.0, 1
+            return step_model.NewtonStatusCode.OK, 0.0, 1
         previous = math.inf
-        for iteration in range(1, NEWTON_ITERATION_LIMIT + 1):
+        for iteration in range(1, step_model.NEWTON_ITERATION_LIMIT + 1):
             residual = value(point)[0][self._residual, 0]
             if not np.isfinite(residual).all():
-                return NewtonStatusCode.NOT_FINITE, error, iteration
+                return step_model.NewtonStatusCode.NOT_FINITE, error, iteration
             factors = _factorised(slope(point)[0])
             if factors is None:
-                return NewtonStatusCode.SINGULAR, error, iteration
+                return step_model.NewtonStatusCode.SINGULAR, error, iteration
             change = -_solved(factors, residual)
             error = largest(change)
             if not math.isfinite(error):
-                return NewtonStatusCode.NOT_FINITE, error, iteration
+                return step_model.NewtonStatusCode.NOT_FINITE, error, iteration
             is_near = error < 1e3 * tolerance
             if error <= tolerance or (is_near and error > 0.5 * previous):
                 point[self._at["lam"]] += change[self._coordinates :]
-                return NewtonStatusCode.OK, error, iteration
+                return step_model.NewtonStatusCode.OK, error, iteration
             work, start = float(residual[balance] @ change[balance]), point[self._unknown]
             if by_work and work == 0:
-                return NewtonStatusCode.NOT_CONVERGED, error, iteration
+                return step_model.NewtonStatusCode.NOT_CONVERGED, error, iteration
             longest = min(1.0, 0.5 / error) * (-1.0 if by_work and work < 0 and not is_near else 1.0)
             low, low_left, high, part = 0.0, 1.0, 1.0, 1.0
             while True:
@@ -133,7 +119,7 @@ class InterpretedKernel:
                 if is_good or is_near or (by_work and high - low < 1e-4):
                     break
                 if high - low < 1e-4:
-                    return NewtonStatusCode.NOT_CONVERGED, error, iteration
+                    return step_model.NewtonStatusCode.NOT_CONVERGED, error, iteration
                 if left > 0:
                     low, low_left = part, left
                 else:
@@ -141,20 +127,20 @@ class InterpretedKernel:
                 root = low + (high - low) * low_left / (low_left - left) if left < 0 else 0.5 * (low + high)
                 part = min(max(root, 0.9 * low + 0.1 * high), 0.1 * low + 0.9 * high)
             previous = error if longest * part == 1.0 else math.inf
-        return NewtonStatusCode.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
+        return step_model.NewtonStatusCode.NOT_CONVERGED, error, step_model.NEWTON_ITERATION_LIMIT
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
-    def rollout(self, inputs: RolloutInputs) -> Rollout:
+    def rollout(self, inputs: step_model.RolloutInputs) -> step_model.Rollout:
         """Simulate one rollout step by step, with its derivatives."""
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
         feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
-        out = allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
+        out = step_model.allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
         state, by = out.state, [getattr(out, f"{name}_sensitivity") for name in ("state", "multipliers", "effort")]
         state[0] = inputs.initial_state
         if wanted is not None:
             by[0][0] = wanted.initial_state_tangents
-        code, error, total, done = NewtonStatusCode.OK, 0.0, 0, 0
+        code, error, total, done = step_model.NewtonStatusCode.OK, 0.0, 0, 0
         for k, u in enumerate(torque):
             x = state[k]
             if feedback is not None:
@@ -167,29 +153,29 @@ class InterpretedKernel:
                 point = self._point(theta, x, first, pull, u)
                 point[self._fixed] = path[k + 1]
                 end, error, spent = self._newton(value, slope, point, by_work)
-                code = end if i == 0 or end == NewtonStatusCode.OK else code
+                code = end if i == 0 or end == step_model.NewtonStatusCode.OK else code
                 total += spent
-                if code == NewtonStatusCode.OK:
+                if code == step_model.NewtonStatusCode.OK:
                     break
             outputs, lam = value(point)[0][:, 0], point[self._at["lam"]]
             state[k + 1] = np.concatenate([point[self._at["q1"]], outputs[self._p1], point[self._at["z1"]]])
-            if code != NewtonStatusCode.OK:
+            if code != step_model.NewtonStatusCode.OK:
                 break
             out.torque[k], out.multipliers[k], out.effort[k] = u, lam, outputs[self._effort]
             if wanted is not None:
                 moved = self._moved(slopes(point)[0], wanted, feedback, by[0][k], k)
                 if moved is None:
-                    code = NewtonStatusCode.SINGULAR
+                    code = step_model.NewtonStatusCode.SINGULAR
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return attach_status_to_rollout(out, self._model.sizes, code, done, error, total)
+        return step_model.attach_status_to_rollout(out, self._model.sizes, code, done, error, total)
 
     def _moved(
         self,
         slopes: Array,
-        wanted: SensitivityDirections,
-        feedback: TrackingFeedback | None,
+        wanted: step_model.SensitivityDirections,
+        feedback: step_model.TrackingFeedback | None,
         before: Array,
         k: int,
         loads: tuple[Array, Array] | None = None,
@@ -221,12 +207,17 @@ class InterpretedKernel:
         return after, moved[at["lam"]], change[self._effort]
 
     def linearized_rollout_steps(
-        self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
+        self,
+        theta: Array,
+        along: step_model.Rollout,
+        feedback: step_model.TrackingFeedback | None,
+        inputs: Array,
+        loads: tuple[Array, Array],
     ) -> tuple[Array, Array]:
         """Compute the derivatives of a rollout's steps, as `step.linearized_rollout_steps` describes them."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
-        wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
+        wanted = step_model.SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
         found = []
         for k, u in enumerate(along.torque):
             point = self._point(theta, along.state[k], along.state[k + 1], along.multipliers[k], u)
@@ -236,18 +227,18 @@ class InterpretedKernel:
             found.append((moved[0], np.vstack([moved[2], moved[1] / self._model.time_step])))
         return np.array([one[0] for one in found]), np.array([one[1] for one in found])
 
-    def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
+    def rollout_batch(self, members: Sequence[step_model.RolloutInputs]) -> list[step_model.Rollout]:
         """Simulate several rollouts one after another."""
         return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
         self,
         theta: Array,
-        rollout: Rollout,
-        feedback: TrackingFeedback | None,
+        rollout: step_model.Rollout,
+        feedback: step_model.TrackingFeedback | None,
         names: tuple[str, ...],
-        by: CostDerivativesByRolloutOutputs,
-    ) -> RolloutCostGradient:
+        by: step_model.CostDerivativesByRolloutOutputs,
+    ) -> step_model.RolloutCostGradient:
         """Compute the gradient of a cost J along a rollout by the adjoint method. `by` holds J's partial derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
@@ -269,7 +260,9 @@ class InterpretedKernel:
             by_point[at["lam"]] += 0.0 if by_multipliers is None else by_multipliers[k]
             factors = _factorised(jacobian[self._square].T)
             if factors is None:
-                return RolloutCostGradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
+                return step_model.RolloutCostGradient(
+                    *(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path))
+                )
             by_point -= jacobian[self._residual].T @ _solved(factors, by_point[self._unknown])
             by_theta += by_point[self._columns(names)]
             by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
@@ -277,14 +270,14 @@ class InterpretedKernel:
             if feedback is not None:
                 np.subtract.at(costate, feedback.state_indices, feedback.gain[k].T @ by_torque[k])
         by_path[0] = costate[list(self._model.system.prescribed_coordinate_indices)]
-        return RolloutCostGradient(by_theta, costate, by_torque, by_path)
+        return step_model.RolloutCostGradient(by_theta, costate, by_torque, by_path)
 
     def step_residuals_and_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepResidualsAndJacobians:
+    ) -> step_model.StepResidualsAndJacobians:
         """Evaluate the step residuals along any trajectory. Without `derivatives`, the Jacobians are empty."""
         (value, _, slopes), at = self._evaluators(), self._at
-        out = allocate_step_linearizations(self._model.sizes, len(torque), len(names), derivatives)
+        out = step_model.allocate_step_linearizations(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
         columns = {"new": new, "old": old, "input": at["u"], "theta": self._columns(names)}
         for k, u in enumerate(torque):

@@ -183,6 +183,11 @@ def compile_step(
         If False, or if the machine has no compiler (with one log message), the step is interpreted.
     tolerance : float, optional
         Correction of the coordinates at which Newton's method stops [rad or m]; default: from the time step.
+
+    Returns
+    -------
+    Step
+        Map from (q, p, z) [rad or m, N m s or N s, 1] to these values one time step later.
     """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force_at, tolerance)
     library = None
@@ -238,7 +243,7 @@ def simulate(
 ) -> Rollout:
     """Simulate a system for N = `steps` time steps.
 
-    If Newton's method fails, `status` reports it, and later entries are NaN. Raises `ModelError` for a wrong shape.
+    Raises `ModelError` for a wrong shape.
 
     Parameters
     ----------
@@ -254,6 +259,11 @@ def simulate(
         Correction of the torque by the state.
     directions : SensitivityDirections, optional
         Directions along which the result has derivatives; default: it has none.
+
+    Returns
+    -------
+    Rollout
+        States (N + 1, nx) with units as `start`. If Newton's method fails, `status` says so, and later entries are NaN.
     """
     inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
     return step.kernel.rollout_batch([inputs])[0]

@@ -33,7 +33,7 @@ AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0,
 
 @dataclass(frozen=True)
 class FlexibleSegment:
-    """One segment of a flexible object, such as a tube, a branch or a beam."""
+    """One segment of a flexible object, such as a tube [m, kg]. `flexible_object` raises `ModelError` for a fault."""
 
     name: str
     length: float

@@ -34,7 +34,7 @@ _GRASP_EQUATION_NAMES = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp that keeps a point of the object at a point of its holder. Some kinds also align axes."""
+    """A grasp that keeps a point of the object at one of its holder. `System.build` raises `ModelError` for a fault."""
 
     name: str
     """`left`, `right`, `gripper`, or a clamp's name."""
@@ -260,7 +260,7 @@ class SystemBuildArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """The complete model of robot and object, with parameters, springs, dampers, grasps, inputs and effects."""
+    """The model of robot and object: coordinates q (n,) [rad or m], parameters theta (ntheta,), inputs u (nu,)."""
 
     mechanism: Mechanism
     parameters: Parameters

@@ -18,15 +18,8 @@ from yid_ocp.errors import ConfigError, SolverError, require_known_names
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
+from yid_ocp.planning import motion_search
 from yid_ocp.planning.joint_paths import FramePositionEvaluator, PlannedMotion, PlanOptions
-from yid_ocp.planning.motion_search import (
-    DOptimalityCriterion,
-    EffectDiscriminationCriterion,
-    InformativeMotionSearch,
-    MotionSearchCriterion,
-    MotionSearchResult,
-    PlanResidualAndLimitFunctions,
-)
 from yid_ocp.planning.planned_experiment import SplineMotionExperiment
 from yid_ocp.problem import EstimationProblem
 
@@ -54,7 +47,7 @@ class InformativeMotionPlan(PlannedMotion):
     # for each pair of effects: distance of the first effect's change of the data from its best imitation by the second
     # effect and all free unknowns [data stds], in the existing recordings and in the planned one; empty without effects
     effect_distances: Mapping[tuple[str, str], tuple[float, float]]
-    start_results: tuple[MotionSearchResult, ...]  # of the random initial motions, in the order drawn
+    start_results: tuple[motion_search.MotionSearchResult, ...]  # of the random initial motions, in the order drawn
     active_limits: Mapping[str, tuple[str, ...]]  # joints, springs or frames that reach a limit, by kind of limit
     unobservable_parameters: Mapping[str, str]  # parameters that no motion informs, each with a measurement that would
     unidentifiable_directions: tuple[str, ...]  # sentences on what else the planned recording leaves unidentifiable
@@ -97,8 +90,8 @@ def plan_informative_motion(
     experiment = SplineMotionExperiment(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionEvaluator(system, system.point_frames)
-    limits = PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
-    search = InformativeMotionSearch(experiment, limits, _criterion(experiment, chosen, rivals))
+    limits = motion_search.PlanResidualAndLimitFunctions(experiment.simulator, options, points, np.zeros(3), still)
+    search = motion_search.InformativeMotionSearch(experiment, limits, _criterion(experiment, chosen, rivals))
     _check_room(search)
     seeds = range(options.seed, options.seed + options.n_random_starts)
     begins = [_smooth(experiment, search.shrink_coefficients_to_limits(_random(experiment, seed))) for seed in seeds]
@@ -160,15 +153,17 @@ def _effects(
 
 def _criterion(
     experiment: SplineMotionExperiment, chosen: Sequence[str], rivals: Sequence[EffectBase]
-) -> MotionSearchCriterion:
+) -> motion_search.MotionSearchCriterion:
     columns = [name.split("[")[0] for name in experiment.sensitivity_column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
-        return DOptimalityCriterion(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
+        return motion_search.DOptimalityCriterion(
+            tuple(i for i, name in enumerate(columns) if name in chosen), parameters
+        )
     places = tuple(tuple(map(columns.index, effect.amplitude_parameter_names)) for effect in rivals)
     scales = (experiment.scales_of_estimated_unknowns[list(own)][:, None] for own in places)
     sizes = tuple(_size(effect) / scale for effect, scale in zip(rivals, scales, strict=True))
-    return EffectDiscriminationCriterion(places, sizes, parameters)
+    return motion_search.EffectDiscriminationCriterion(places, sizes, parameters)
 
 
 def _size(effect: EffectBase) -> Array:
@@ -181,7 +176,7 @@ def _size(effect: EffectBase) -> Array:
     return np.diag([(high - low) / 2 for low, high in ranges])
 
 
-def _check_room(search: InformativeMotionSearch) -> None:
+def _check_room(search: motion_search.InformativeMotionSearch) -> None:
     """Raise `ConfigError` if the arms exceed a velocity, effort or spring limit before they move."""
     mover, still = search.experiment.simulator, search.experiment.zero_coefficients
     values, _ = search.limits.constraints_and_jacobian(mover.simulate_path(still), still)
@@ -257,8 +252,8 @@ def _would_see(experiment: SplineMotionExperiment, name: str, w: Array) -> str:
 
 
 def _plan(
-    search: InformativeMotionSearch,
-    found: Sequence[MotionSearchResult],
+    search: motion_search.InformativeMotionSearch,
+    found: Sequence[motion_search.MotionSearchResult],
     rivals: Sequence[EffectBase],
     unseen: Mapping[str, float],
 ) -> InformativeMotionPlan:
@@ -312,10 +307,10 @@ def _parameters(experiment: SplineMotionExperiment, w: Array) -> tuple[dict[str,
 
 
 def _distances(
-    search: InformativeMotionSearch, rivals: Sequence[EffectBase], w: Array
+    search: motion_search.InformativeMotionSearch, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     experiment, criterion, found = search.experiment, search.criterion, {}
-    assert isinstance(criterion, EffectDiscriminationCriterion)
+    assert isinstance(criterion, motion_search.EffectDiscriminationCriterion)
     recorded, planned = experiment.existing_recording_sensitivities, experiment.planned_recording_sensitivities(w)
     for (i, one), (j, other) in itertools.permutations(enumerate(rivals), 2):
         distances = criterion.imitation_distance(recorded, i, j), criterion.imitation_distance(planned, i, j)
@@ -323,7 +318,7 @@ def _distances(
     return found
 
 
-def _active(search: InformativeMotionSearch, w: Array) -> dict[str, tuple[str, ...]]:
+def _active(search: motion_search.InformativeMotionSearch, w: Array) -> dict[str, tuple[str, ...]]:
     mover, limits, found = search.experiment.simulator, search.limits, {}
 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:

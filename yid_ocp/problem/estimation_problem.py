@@ -419,7 +419,11 @@ def checked_unknowns(problem: EstimationProblem, values: ArrayLike, where: str) 
         raise ConfigError(what, where=where, allowed=f"a value of each of {abbreviated_names_text(names)}", hint=hint)
     for name, value, lower, upper in zip(names, x.tolist(), *problem.bounds, strict=True):
         shared = name.partition("[")[0]
-        Parameter(name, value, known[shared].unit if shared in known else "1", lower, upper)  # checks its bounds
+        try:
+            Parameter(name, value, known[shared].unit if shared in known else "1", lower, upper)
+        except ConfigError as error:
+            error.where, error.hint = where, f"change the value of {name}, or its bounds in the configuration"
+            raise
     return x
 
 

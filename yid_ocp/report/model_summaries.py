@@ -1,25 +1,14 @@
-"""Summaries of the results of `inspect` and `export`, for the terminal and the HTML report."""
+"""Summaries of the results of `inspect`, `export` and `track`, for the terminal and the HTML report."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, kind_of_part, names_by_kind_text
 from yid_ocp.inference.uncertainty import percent_number_text
-from yid_ocp.report.terminal import (
-    SUMMARIES,
-    CodeBlock,
-    SummaryBlockOrTextIterator,
-    SummaryStatement,
-    SummaryTable,
-    TableRows,
-    bound_range_text,
-    next_steps_table,
-    scale_and_unit_with_metres_as_mm,
-    shown_unit,
-    value_text_and_display_unit,
-)
+from yid_ocp.report import terminal
 
 _MAX_ROW_NAMES_LENGTH = 60  # largest number of characters of a cell with names
 _MAX_FORMULA_LINES = 30  # of a shown formula; result.json has longer ones
@@ -28,8 +17,8 @@ _MIN_VISIBLE_CHANGE = 3  # of all readings by a change of a parameter, which noi
 _NEGLIGIBLE_STDS = 1e-6  # in stds: smaller values are numerical errors of an equilibrium, accumulated over steps
 
 
-@SUMMARIES.register("yid-inspect/1")
-def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+@terminal.SUMMARIES.register("yid-inspect/1")
+def _inspect_summary(result: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIterator:
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "servo", "prescribed", "free") if role in roles]
     m, linear = result["equations"]["sizes"]["m"], result["linearisation"]
@@ -42,45 +31,46 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     if hidden:
         text = f"At the initial values, the recordings can hardly determine {abbreviated_names_text(hidden)}, because "
         text += "noise hides the changes listed below. `yid-ocp identifiability` tests this after a fit."
-    yield SummaryStatement(text if changes and not is_formula_asked else "", "conclusion")
+    yield terminal.SummaryStatement(text if changes and not is_formula_asked else "", "conclusion")
     for entry in entries:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g} (SI units)"
-        yield SummaryStatement(f"The value of {entry['title']} at {linear['at']} is {value}.", "conclusion")
+        yield terminal.SummaryStatement(f"The value of {entry['title']} at {linear['at']} is {value}.", "conclusion")
         is_long = (count := len(entry["lines"])) > _MAX_FORMULA_LINES
-        yield CodeBlock("" if is_long else "\n".join(entry["lines"]))
+        yield terminal.CodeBlock("" if is_long else "\n".join(entry["lines"]))
         yield f"Its formula has {count} lines, which are in result.json (`entries`)." if is_long else ""
     size = f"{count_with_noun(len(roles), 'coordinate')} ({', '.join(counts)}) and {count_with_noun(m, 'constraint')}"
-    yield SummaryStatement(f"The model has {size}.", "verdict")
+    yield terminal.SummaryStatement(f"The model has {size}.", "verdict")
     radius = linear["spectral_radius"]
     grown = f"grow by up to {percent_number_text(radius - 1)} % per step" if radius > 1 + 1e-6 else "do not grow"
     said = f"Near {linear['at']}, small deviations {grown} (spectral radius of the matrix A of a step: {radius:.6g})."
     said += " Growth is usual where torques move an arm, as the model has no controller." if radius > 1 + 1e-6 else ""
-    yield SummaryStatement(said, "verdict")
+    yield terminal.SummaryStatement(said, "verdict")
     rows, equations = _dependence_rows(result)
     title = "How much a change of a parameter changes the recorded readings"
-    yield SummaryTable(rows, title, is_key_table=True, is_page_only=is_formula_asked)
+    yield terminal.SummaryTable(rows, title, is_key_table=True, is_page_only=is_formula_asked)
     title = "Equations of a step that contain the parameter (del: momentum balance, p1: momentum after the step)"
-    yield SummaryTable(equations, title, is_page_only=not result["asked"])
+    yield terminal.SummaryTable(equations, title, is_page_only=not result["asked"])
     rows = [("parameter", "value", "unit", "bounds", "use", "meaning")]
     for name in result["asked"] or result["parameters"]:
         entry = result["parameters"][name]
-        cells = (f"{entry['value']:.6g}", shown_unit(entry["unit"]), bound_range_text(entry, 6))
+        cells = (f"{entry['value']:.6g}", terminal.shown_unit(entry["unit"]), terminal.bound_range_text(entry, 6))
         rows.append((name, *cells, "free" if entry["free"] else "fixed", entry["description"]))
-    yield SummaryTable(rows, "Parameters" if result["asked"] else "All parameters", is_page_only=is_formula_asked)
+    title = "Parameters" if result["asked"] else "All parameters"
+    yield terminal.SummaryTable(rows, title, is_page_only=is_formula_asked)
     files = ", ".join(("linearisation.h5 (A and other derivatives of the state after a step)", *result["exported"]))
     yield f"The folder has equations.txt (all equations and their names), {files}, and sparsity.png (pattern of zeros)."
     step = "test whether the recordings determine free parameters"
-    yield next_steps_table(result, {step: "identifiability"} if changes and not is_formula_asked else {})
+    yield terminal.next_steps_table(result, {step: "identifiability"} if changes and not is_formula_asked else {})
 
 
-def _dependence_rows(result: Mapping[str, Any]) -> tuple[TableRows, TableRows]:
+def _dependence_rows(result: Mapping[str, Any]) -> tuple[terminal.TableRows, terminal.TableRows]:
     """Return how a change of each named (else each free) parameter changes the readings, and the equations with it."""
     known: Mapping[str, Mapping[str, Any]] = result["dependence"]
     shown = [name for name in known if result["parameters"][name]["free"]]
     visible = f"visible (at least {_MIN_VISIBLE_CHANGE})"
     heads = ("effect on all readings / noise", visible, "most sensitive sensor")
-    moved: TableRows = [("parameter", "change (10 % of value or bound)", *heads)]
-    equations: TableRows = [("parameter", "equations", "of these, observed by sensors")]
+    moved: terminal.TableRows = [("parameter", "change (10 % of value or bound)", *heads)]
+    equations: terminal.TableRows = [("parameter", "equations", "of these, observed by sensors")]
     for name in dict.fromkeys(result["asked"] or shown):
         own, change = known[name], _shown_change(result["parameters"][name])
         rows, seen = own["rows"], own["seen"]
@@ -110,8 +100,8 @@ def _row_names_text(names: Sequence[str]) -> str:
     return text if len(text) <= _MAX_ROW_NAMES_LENGTH else count_with_noun(len(names), "equation")
 
 
-@SUMMARIES.register("yid-export/1")
-def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
+@terminal.SUMMARIES.register("yid-export/1")
+def _export_summary(manifest: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIterator:
     """Summarise an export: how the format expresses effects and estimates, and the errors of its replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     shown = (n for n, own in manifest["parameters"].items() if own["estimated"] or own["status"] != "native")
@@ -120,25 +110,26 @@ def _export_summary(manifest: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     entries = (manifest["effects"] | grasps | listed).items()
     lost = [name for name, entry in entries if entry["status"] == "not representable"]
     said = f"The file lacks {names_by_kind_text(lost)}, so its predictions differ from those of the run."
-    yield SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
+    yield terminal.SummaryStatement(said if lost else "The file has all parts of the model.", "conclusion")
     unknown = [name for name in manifest["unknown"] if not {name, name.rpartition(".")[0]}.intersection(lost)]
     gate = manifest["gate"] or {}
-    yield from (SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
+    yield from (terminal.SummaryStatement(text, "conclusion") for text in _replay_sentences(gate, unknown))
     text = f"Do not rely on these values in the file, which the run did not find: {abbreviated_names_text(unknown)}."
-    yield SummaryStatement(text if unknown else "", "verdict")
+    yield terminal.SummaryStatement(text if unknown else "", "verdict")
     gain_of = manifest.get("gain_of")
     text = f"The gains in the file are those of servos whose firmware has the gain stated in '{gain_of}'."
-    yield SummaryStatement(text if gain_of else "", "verdict")
+    yield terminal.SummaryStatement(text if gain_of else "", "verdict")
     kinds = {"native": "exact", "emulated": "approximated", "not representable": "missing"}
     alike = grouped(((kind_of_part(name), kinds[own["status"]], own["how"]), name) for name, own in entries)
-    rows: TableRows = [("part of the model", "in the file", "how, or why not")]
+    rows: terminal.TableRows = [("part of the model", "in the file", "how, or why not")]
     rows += [(names_by_kind_text(names), *cells) for (_, *cells), names in alike.items()]
-    yield SummaryTable(rows, "Parts of the model in the file")
+    yield terminal.SummaryTable(rows, "Parts of the model in the file")
     rows = [("channel", "with initial values", "with exported values", "noise alone", "unit")]
     for name, entry in gate.get("channels", {}).items():
-        sizes = (value_text_and_display_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
-        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
-    yield SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
+        errors = map(entry.__getitem__, ("before", "after", "noise"))
+        sizes = (terminal.value_text_and_display_unit(error, entry["unit"])[0] for error in errors)
+        rows.append((name, *sizes, terminal.scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
+    yield terminal.SummaryTable(rows, "Errors (rms) of the replay in MuJoCo")
 
 
 def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Iterator[str]:
@@ -159,3 +150,28 @@ def _replay_sentences(gate: Mapping[str, Any], unreliable: Sequence[str]) -> Ite
     text += f"{worst}) is {ratios[worst]:.4g} times its noise (allowed: up to {_MAX_REPRODUCED_ERROR})."
     yield f"{text} With the initial values, the largest one of all channels is {max(initial.values()):.4g} times."
     yield "Unreliable values may be the cause." if is_bad and unreliable else ""
+
+
+@terminal.SUMMARIES.register("yid-track/1")
+def _track_summary(result: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIterator:
+    truth = result["truth_errors"]
+    heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
+    rows: terminal.TableRows = [("point", "images", "± [mm]", *heads)]
+    for name, entry in result["points"].items():
+        cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
+        rows.append((name, str(entry["frames"]), *cells))
+    yield from terminal.issue_summary_blocks(result)
+    used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
+    used += "recording.h5 has their points."
+    used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
+    yield terminal.SummaryStatement(result["refused"] or used, "verdict")
+    yield terminal.SummaryTable(rows, "Tracked points", is_key_table=True)
+    for why, n in result["dropped"].items():
+        of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
+        first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)
+        yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
+    yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
+    yield from (thing["text"] for thing in result["things"])
+    steps = {"estimate the parameters that the configuration frees": "solve --set 'recordings.estimate=[recording.h5]'"}
+    yield terminal.next_steps_table(result, {} if result["refused"] else steps)

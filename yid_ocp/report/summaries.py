@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.analysis.estimation import BASELINE_DESCRIPTIONS, channel_or_group_unit
-from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped
 from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import (
@@ -104,14 +103,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         rows.append((name, value, std, interval, *more))
     is_useless = not (converged or is_trusted)
     yield SummaryTable(rows, "Estimates of the free parameters", is_key_table=True, is_page_only=is_useless)
-    has_noise = any(entry.get("expected") for entry in result["residuals"].values())
-    rows = [("channel", "error", *["noise alone"] * has_noise, "unit", "used samples")]
-    for name, entry in result["residuals"].items():
-        sizes = [entry["rmse"], *[entry.get("expected")] * has_noise]
-        shown = [value_text_and_display_unit(size, entry["unit"]) for size in sizes]
-        rows.append((name, *(text for text, _ in shown), shown[0][1], str(entry["n"])))
-    has_others = any(entry["rmse"] for entry in result["held_out"])
-    yield SummaryTable(rows, "Errors on fitted recordings (rms; of points: of the distance)", is_page_only=has_others)
+    yield from _fitted_error_blocks(result["residuals"], result["held_out"])
     yield from _held_out_blocks(result)
     yield torque_offset_table(result)
     yield large_torque_offsets_sentence(result)
@@ -185,6 +177,28 @@ def _gap_sentences(result: Mapping[str, Any]) -> Iterator[str]:
 
 def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(statistics.fmean(x**2 for x in values)) if values else None
+
+
+def _fitted_error_blocks(
+    residuals: Mapping[str, Mapping[str, Any]], held_out: Sequence[Mapping[str, Any]]
+) -> SummaryBlockOrTextIterator:
+    """Yield fit errors of each channel, by the model, noise alone and baselines. `held_out` has errors of others."""
+    guesses = (f"without model: {words}" for words in BASELINE_DESCRIPTIONS.values())
+    rows: TableRows = [("channel", "model", "noise alone", *guesses, "unit", "used samples")]
+    over_noise, over_guess = list[float](), list[float]()
+    for name, entry in residuals.items():
+        known = [entry.get("baselines", {}).get(guess) for guess in BASELINE_DESCRIPTIONS]
+        sizes = entry["rmse"], entry.get("expected"), *known
+        cells = (value_text_and_display_unit(size, entry["unit"])[0] * (size is not None) for size in sizes)
+        rows.append((name, *cells, scale_and_unit_with_metres_as_mm(entry["unit"])[1], str(entry["n"])))
+        over_noise += [entry["rmse"] / entry["expected"]] if entry.get("expected") else []
+        over_guess += [entry["rmse"] / min(filter(None, known))] if any(known) else []
+    is_aside = any(entry["rmse"] for entry in held_out)
+    yield SummaryTable(rows, "Errors (rms) on fitted recordings; of points: of the distance", is_page_only=is_aside)
+    said = [f"{max(over_noise):.2g} times that of noise alone"] if over_noise else []
+    said += [f"{percent_number_text(max(over_guess))} % of that without a model"] if over_guess else []
+    text = f"The model's error on fitted recordings is at most {' and '.join(said)}. No recording is held out "
+    yield f"{text}(recordings.held_out), so errors on other motions are unknown." if said and not held_out else ""
 
 
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
@@ -582,28 +596,3 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
     option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
     step = f"solve --set {option} --set 'recordings.held_out=[]'"
     yield next_steps_table(result, {"estimate parameters by the same model": step})
-
-
-@SUMMARIES.register("yid-track/1")
-def _track_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    truth = result["truth_errors"]
-    heads = ("median error [mm] (true value known)", "largest error [mm]") if truth else ("", "")
-    rows: TableRows = [("point", "images", "± [mm]", *heads)]
-    for name, entry in result["points"].items():
-        cells = ["–" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
-        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
-        rows.append((name, str(entry["frames"]), *cells))
-    yield from issue_summary_blocks(result)
-    used = f"{sum(not frame['reason'] for frame in result['frames'])} of {len(result['frames'])} images are used. "
-    used += "recording.h5 has their points."
-    used += " So few images determine little." * (len(result["frames"]) < QUALITY_LIMITS.min_samples)
-    yield SummaryStatement(result["refused"] or used, "verdict")
-    yield SummaryTable(rows, "Tracked points", is_key_table=True)
-    for why, n in result["dropped"].items():
-        of_kind = {own["name"]: own["reason"] for own in result["frames"] if own["reason"].partition(":")[0] == why}
-        first = next(iter(of_kind.values()), why).replace(": ", ", for example: " if n > 1 else ": ", 1)
-        yield f"{count_with_noun(n, 'image')} not used, because {first} ({abbreviated_names_text([*of_kind])})."
-    yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
-    yield from (thing["text"] for thing in result["things"])
-    steps = {"estimate the parameters that the configuration frees": "solve --set 'recordings.estimate=[recording.h5]'"}
-    yield next_steps_table(result, {} if result["refused"] else steps)

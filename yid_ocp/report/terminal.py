@@ -167,16 +167,14 @@ def unused_efforts_sentence(result: Mapping[str, Any]) -> str:
 
 
 def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    """Yield the found values of a result to copy, as text (except after `solve`), YAML, MJCF and LaTeX."""
+    """Yield the found values of a result to copy, as text, YAML, MJCF and LaTeX."""
     if use := result.get("to_use"):
+        yield SummaryTable([("value (± is one standard deviation)",), *zip(use["values"])], "To use these numbers")
         ignored, lost = " and ".join(use["uncounted_errors"]), abbreviated_names_text(use.get("left_out", ()))
         yield f"The ± leaves out the error {ignored}." if ignored else ""
-        if result.get("format") != "yid-solve/1":  # whose table has the values
-            yield "Values to use (± is one standard deviation):"
-            yield CodeBlock("\n".join(use["values"]))
-            yield f"Not listed, because they are not known well enough: {lost}." if lost else ""
-            zero = abbreviated_names_text(use.get("near_zero", ()))
-            yield f"Not listed, because they do not differ from zero by more than two ±: {zero}." if zero else ""
+        yield f"Not listed, because they are not known well enough: {lost}." if lost else ""
+        zero = abbreviated_names_text(use.get("near_zero", ()))
+        yield f"Not listed, because they do not differ from zero by more than two ±: {zero}." if zero else ""
         kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():

@@ -28,7 +28,7 @@ _NonNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """The settings of one sensor group, such as `points` or `joints.effort`."""
+    """The settings of one sensor group, such as `points` [m] or `joints.effort` [N m]; stds are in its unit."""
 
     use: Annotated[
         bool | None,

@@ -46,11 +46,11 @@ log = logging.getLogger(__name__)
 
 
 class Status(str, Enum):
-    """The status with which a solver ended."""
+    """How a solver ended: `stopped` by a callback, `stalled` if no step lowers the cost or the step is unstable."""
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "iteration_limit"
-    STOPPED = "stopped"  # by a callback, such as one with a time limit
+    STOPPED = "stopped"
     STALLED = "stalled"
     FAILED = "failed"
 

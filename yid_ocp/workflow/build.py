@@ -37,12 +37,6 @@ from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, StiffnessAndRest
 from yid_ocp.model.urdf import read_urdf, urdf_path_from_robot_name
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.workflow import run_inputs
-from yid_ocp.workflow.run_inputs import (
-    add_setting_location_to_errors,
-    check_names_in_setting,
-    read_recordings_of_role,
-    unknown_name_error,
-)
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping, next to the joints' keys
 _DEFAULT_JOINT_DAMPING = 0.05  # damping of joints without an entry [N m s/rad]
@@ -69,19 +63,19 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         try:
             robot = read_urdf(model.robot, **urdf_reader_arguments(run))
         except YidError as error:
-            with add_setting_location_to_errors(run, "model", "robot"):
+            with run_inputs.add_setting_location_to_errors(run, "model", "robot"):
                 read_urdf(model.robot)  # an error of the file itself
-            with add_setting_location_to_errors(run, "model", "arms", "joints"):
+            with run_inputs.add_setting_location_to_errors(run, "model", "arms", "joints"):
                 raise error
     joints = () if robot is None else robot.joint_names
     damping, of_object = _dampings(run, joints)
     item = model.object
-    with add_setting_location_to_errors(run, "model", "object"):
+    with run_inputs.add_setting_location_to_errors(run, "model", "object"):
         objects = (
             [] if item is None else [(_built_object(item, of_object, link_division), *item.parent_frame_and_root_pose)]
         )
     mode = "driven" if are_arm_states_estimated(run) else arms.mode
-    check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
+    run_inputs.check_names_in_setting(run, "joint", arms.passive_joints, joints, "model", "arms", "passive_joints")
     moved = tuple(name for name in joints if name not in arms.passive_joints)
     for key in ("joints", "passive_joints", "locked_joints"):
         if getattr(arms, key) and robot is None:
@@ -92,11 +86,11 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         what, allowed = "the model has neither a robot nor an object", "a robot, an object or both"
         hint = "set model.robot or model.object" + ("" if run.key_locations else "; the configuration is empty")
         raise run.config_error(what, "model", allowed=allowed, hint=hint)
-    with add_setting_location_to_errors(run, "model", "frames"):
+    with run_inputs.add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot, [item for item, *_ in objects])
-    with add_setting_location_to_errors(run, "model", "object", "mount", "parent_frame"):
+    with run_inputs.add_setting_location_to_errors(run, "model", "object", "mount", "parent_frame"):
         _ = [carrier.frame(frame) for _, frame, _ in objects if carrier is not None and frame]
-    with add_setting_location_to_errors(run, "model"):
+    with run_inputs.add_setting_location_to_errors(run, "model"):
         system = System.build(
             carrier,
             objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
@@ -114,7 +108,9 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         )
     if any(said.use_recorded_straight_position for said in model.frames.values()) and run.recordings.estimate:
         # marker positions if no recording is specified
-        [places] = marker_position_values_by_recording(run, system, read_recordings_of_role(run, count=1)).values()
+        [places] = marker_position_values_by_recording(
+            run, system, run_inputs.read_recordings_of_role(run, count=1)
+        ).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)
 
@@ -138,13 +134,13 @@ def build_step(run: RunSettings, system: System | None = None) -> Step:
 
 
 def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
-    """Build the system that a configuration file describes. Errors are as in `load_config` and `build_system`."""
+    """Build the system of a configuration file. Raises `ConfigError`, `DataError` or `ModelError` for a fault in it."""
     return build_system(load_config(path, overrides))
 
 
 def cable_vertices_between_clamps(run: RunSettings) -> CableVertices | None:
     """Return the measured vertices and clamps of a run's cable. None for an object that is not held by clamps."""
-    with add_setting_location_to_errors(run, "model", "object"):
+    with run_inputs.add_setting_location_to_errors(run, "model", "object"):
         return None if run.model.object is None else run.model.object.clamped_cable_vertices()
 
 
@@ -157,7 +153,7 @@ def are_arm_states_estimated(run: RunSettings) -> bool:
     item = run.model.object
     if run.model.arms.mode != "prescribed" or not run.model.grasp or (item and item.parent_frame_and_root_pose[0]):
         return False
-    recordings = read_recordings_of_role(run)
+    recordings = run_inputs.read_recordings_of_role(run)
     mounted = [key for recording in recordings for key, *_ in recording.mounted_sensor_channels]
     if any(run.sensors.get(key, SensorOptions()).use is not False for key in mounted):
         return False
@@ -169,7 +165,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     of_file = {name: own["damping"] for name, own in _robot_file_constants(run).items() if "damping" in own}
     if isinstance(said, Mapping):
         known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
-        check_names_in_setting(run, "joint", said, known, "model", "damping")
+        run_inputs.check_names_in_setting(run, "joint", said, known, "model", "damping")
         if has_object and _OBJECT_DAMPING_KEY not in said:
             allowed = f"joints of the robot and `{_OBJECT_DAMPING_KEY}`, for all joints of the object"
             what = "model.damping lists dampings of joints, but not that of the object"
@@ -180,7 +176,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
     else:
         damping, of_object = {name: of_file.get(name, said) for name in joints}, said
     springs = run.model.joint_springs
-    check_names_in_setting(run, "joint", springs, joints, "model", "joint_springs")
+    run_inputs.check_names_in_setting(run, "joint", springs, joints, "model", "joint_springs")
     return damping | {name: own.damping for name, own in springs.items() if own.damping is not None}, of_object
 
 
@@ -191,11 +187,11 @@ def _clamped_system(run: RunSettings, cable: CableVertices) -> System:
         if getattr(run.model, key):
             what, allowed = f"model.{key} is not possible for an object of kind {kind}, which clamps hold", f"no {key}"
             raise run.config_error(what, "model", key, allowed=allowed, hint=f"remove model.{key}")
-    recordings = read_recordings_of_role(run)
+    recordings = run_inputs.read_recordings_of_role(run)
     if not recordings:
         what, hint = f"the lengths of a {kind} are computed from recordings, but none is listed", "list its recordings"
         raise run.config_error(what, "recordings", "estimate", allowed="one recording or more", hint=hint)
-    with add_setting_location_to_errors(run, "model", "object"):
+    with run_inputs.add_setting_location_to_errors(run, "model", "object"):
         lengths = typical_point_pair_distances(cable.edge_vertex_names, recordings)
         return run.model.object.build_system_with_clamps(lengths, run.model.gravity)
 
@@ -213,7 +209,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
         made = [make_effect(kind, joint, system) for kind in kinds if f"{kind}@{joint}" not in named]
         system = system.with_effects([effect_with_sign_smoothing_speed(effect, speed) for effect in made])
     for i, said in enumerate(run.model.effects):
-        with add_setting_location_to_errors(run, "model", "effects", i):
+        with run_inputs.add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([_stated_effect(said, system)])
     system = _with_robot_file_constants(run, system)
     chosen, entries = settings_by_parameter_name(run, system.parameters), []
@@ -231,7 +227,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are {fault}"
                 allowed = f"two numbers from {entry.lower:g} to {entry.upper:g} {entry.unit}, the lower one first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed, hint=hint)
-            with add_setting_location_to_errors(run, "parameters", key, "initial"):
+            with run_inputs.add_setting_location_to_errors(run, "parameters", key, "initial"):
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
     return replace(system, parameters=Parameters(entries))
@@ -295,7 +291,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
             split = [name.rpartition(".") for name in parameters.names]
             owner = key.rpartition(".")[0]  # for a pattern such as T*.bend, patterns are proposed
             alike = dict.fromkeys(f"{owner}.{end}" for own, _, end in split if "*" in owner and _matches(own, owner))
-            error = unknown_name_error(run, "parameter", key, alike or parameters.names, "parameters", key)
+            error = run_inputs.unknown_name_error(run, "parameter", key, alike or parameters.names, "parameters", key)
             if ".servo_" in key and run.model.arms.mode != "servo":
                 error.hint = f"set model.arms.mode: servo, which has this parameter, or delete parameters.{key}"
             raise error
@@ -314,7 +310,7 @@ def friction_joint_names(run: RunSettings, system: System) -> tuple[str, ...]:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
     chosen = known if run.model.friction.joints is None else run.model.friction.joints
-    check_names_in_setting(run, "joint", chosen, known, "model", "friction", "joints")
+    run_inputs.check_names_in_setting(run, "joint", chosen, known, "model", "friction", "joints")
     return chosen
 
 
@@ -423,7 +419,7 @@ def _with_extra_frames(
             if parent is not None and not tree.has_frame(parent):
                 known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
                 known += [f"{segment}:40%" for item in made for segment in item.mechanism.link_chains]
-                raise unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
+                raise run_inputs.unknown_name_error(run, "frame", parent, known, *where, "parent_frame")
         pose = np.eye(4) if said.use_recorded_straight_position else transform_from_xyz_rpy(said.xyz, said.rpy)
         tree = tree.with_added_frame(name, parent, pose)
         if said.use_recorded_straight_position or said.position_std > 0:

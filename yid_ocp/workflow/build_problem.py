@@ -239,7 +239,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """Build the estimation problem of a configuration file (None: the embedded one). Errors: `build_problem`."""
+    """Build the problem of a file or the embedded one. Raises `ConfigError`, `DataError` or `ModelError` for faults."""
     return build_problem(load_config(path, overrides))
 
 

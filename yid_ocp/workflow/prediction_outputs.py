@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from yid_ocp.display import grouped
 from yid_ocp.errors import DataError
 from yid_ocp.inference import whitening
 from yid_ocp.inference.smoother import smoothed_unknown_units
-from yid_ocp.inference.uncertainty import ParameterEstimate
+from yid_ocp.inference.uncertainty import ParameterEstimate, value_and_uncertainty_text
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -84,7 +85,7 @@ def copyable_estimate_texts(
     The keys are `values` (lines NAME = VALUE ± STD), `uncounted_errors` (not in ±), `left_out` (parameters not found),
     `near_zero` (less than two stds from zero), `joints` (number of links, range of joint stiffness [N m/rad], by
     segment and deformation), lines of `yaml` (first `model_yaml`) and `mjcf`, rows of `latex`, `export` (the
-    `command`), `cite`. `theta` (ntheta,) has all parameters.
+    `command`), `cite` (BibTeX). `theta` (ntheta,) has all parameters.
     `values` and `latex` have no offsets of points beside other estimates.
     """
     sure = {n: e for n, e in estimates.items() if e.free and e.verdict == "identifiable"}
@@ -113,7 +114,7 @@ def copyable_estimate_texts(
     shared = {name: e for name, e in found.items() if name in system.parameters}
     starts = (f"  {name}: {{free: true, initial: {e.value:.6g}}}" for name, e in shared.items())
     labels = {n: n.replace("_", r"\_") for n in found}
-    told = {n: f"{e.value:.4g} ± {e.std:.2g}" for n, e in found.items()}
+    told = {n: value_and_uncertainty_text(e.value, e.std, least_digits=2) for n, e in found.items()}
     # nobody quotes the offset of a marker
     offsets = {f"{frame}.{axis}" for frame in system.mechanism.frames for axis in "xyz"}
     quoted = {n: e for n, e in found.items() if n not in offsets} or found
@@ -128,7 +129,7 @@ def copyable_estimate_texts(
         "mjcf": lines,
         "latex": [re.sub(r"(?<=\d)e([+-])0*(\d+)", r" \\cdot 10^{\1\2}", row) for row in rows],
         "export": shlex.join(["yid-ocp", *command]),
-        "cite": "CITATION.cff of yid_ocp",
+        "cite": resources.files("yid_ocp.data").joinpath("defaults", "citation.bib").read_text("utf-8"),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -150,8 +150,8 @@ def estimates_of_each_baseline_run(run: RunSettings) -> tuple[run_estimates.RunE
         if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
             what, hint = f"the baseline run {folder} is given twice", "leave one of the two out"
             raise run.config_error(what, *where, allowed="every baseline run once", hint=hint)
-        if differing := _difference(run, _settings(folder)):
-            what = f"{folder} is a run of another model: {differing}"
+        if differing := _difference({"this configuration": run, str(folder): _settings(folder)}):
+            what = f"the baseline run is of another model: {differing}"
             hint = f"compare `model` with {Path(folder) / 'config.yaml'}, or choose another baseline run"
             raise run.config_error(what, *where, allowed=_SAME_MODEL, hint=hint)
         found.append(own)
@@ -178,37 +178,37 @@ def require_runs_of_one_model(folders: Sequence[Path]) -> None:
         raise ConfigError(dependent, where="arguments of `report`", allowed=allowed, hint=hint)
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
-        if differing := _difference(known[0][1], settings):
-            what = f"{folder} is a run of another model than {known[0][0]}: {differing}"
+        if differing := _difference({str(known[0][0]): known[0][1], str(folder): settings}):
+            what = f"the runs have different models: {differing}"
             hint = "give runs of one model; or, to compare two models, two runs of the same recordings"
             raise ConfigError(what, where=str(folder / "config.yaml"), allowed=_SAME_MODEL, hint=hint)
 
 
-def _difference(run: RunSettings, there: RunSettings | None) -> str:
-    """Say which key of `model` differs first between two runs. Empty if none differs, or `there` is None."""
-    if there is None:
-        return ""
-    for key in _COMPARED_MODEL_SECTIONS:
-        here, other = getattr(run.model, key), getattr(there.model, key)
+def _difference(runs: Mapping[str, RunSettings | None]) -> str:
+    """Say which key of `model` differs first between two runs by label. Empty if none differs, or one is None."""
+    known = [own.model for own in runs.values() if own is not None]
+    for key in _COMPARED_MODEL_SECTIONS if len(known) == 2 else ():
+        here, other = (getattr(model, key) for model in known)
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have been moved
         if isinstance(here, ObjectBuilder) and isinstance(other, ObjectBuilder):
             here, other = here.with_file_names_instead_of_paths(), other.with_file_names_instead_of_paths()
         if here != other:
-            return _first_difference(f"model.{key}", here, other)
+            return _first_difference(f"model.{key}", here, other, runs)
     return ""
 
 
-def _first_difference(key: str, here: Any, there: Any) -> str:
+def _first_difference(key: str, here: Any, there: Any, labels: Iterable[str]) -> str:
     if is_dataclass(here) and type(here) is type(there):
         here, there = vars(here), vars(there)
     if isinstance(here, tuple) and isinstance(there, tuple) and any(map(is_dataclass, here)):
         here, there = dict(enumerate(here)), dict(enumerate(there))
     if isinstance(here, Mapping) and isinstance(there, Mapping):
         name = next(name for name in (*here, *there) if here.get(name) != there.get(name))
-        return _first_difference(f"{key}.{name}", here.get(name), there.get(name))
-    own = (getattr(value, "kind", "set") if is_dataclass(value) else value for value in (there, here))
-    return f"{key} is {' instead of '.join('not set' if value is None else str(value)[:60] for value in own)}"
+        return _first_difference(f"{key}.{name}", here.get(name), there.get(name), labels)
+    own = (getattr(value, "kind", "set") if is_dataclass(value) else value for value in (here, there))
+    said = (f"no {key}" if value is None else f"{key}: {str(value)[:60]}" for value in own)
+    return ", ".join(f"{label} has {words}" for label, words in zip(labels, said, strict=True))
 
 
 def _settings(folder: str | Path) -> RunSettings | None:
@@ -356,7 +356,7 @@ def _overlay_runs(folders: Sequence[Path], out: str | Path | None, progress: Pro
     parameters = _overlaid_parameters(labels, found)
     first, second = map(_settings, folders)
     told = {"format": "yid-overlay/1", "runs": runs, "parameters": parameters, "channels": channels}
-    told["model_difference"] = "" if first is None else _difference(first, second)
+    told["model_difference"] = _difference(dict(zip(labels, (first, second), strict=True)))
     fits = {label: result.get("fit", {}) for label, result in zip(labels, results, strict=True)}
     told["poor"] = [label for label, fit in fits.items() if fit.get("explains") is False]
     settings = RunSettings(name="overlay", description="Two runs of the same recordings, one over the other.")
