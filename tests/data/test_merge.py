@@ -96,7 +96,7 @@ def test_what_cannot_be_aligned_is_refused() -> None:
         merge_recordings([ROBOT, camera()], {"kamera": 1.0})
     with pytest.raises(DataError, match="the joint 'a' is in robot and in twin") as caught:
         merge_recordings([ROBOT, replace(ROBOT, name="twin")])
-    assert "--columns NAME=skip" in caught.value.hint
+    assert "--columns 'q_*=skip'" in caught.value.hint
 
 
 def test_joints_of_two_files_come_to_the_faster_clock_and_equal_groups_keep_their_file() -> None:

@@ -251,7 +251,7 @@ def test_a_group_without_a_sample_has_no_expected_error():
     vars(nothing).update(weight=empty, n_residuals=0, positive_weight_mask=empty > 0)
     nothing.decorrelate_residual_rows = lambda rows: rows
     outcome = SimpleNamespace(predicted_outputs=(np.zeros((0, 3)),))
-    assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [outcome]) == {}
+    assert estimation._expected_errors(SimpleNamespace(measurements=(nothing,)), outcome, [[empty]]) == {}
 
 
 def copied(system, values, uncounted=(), **estimates):

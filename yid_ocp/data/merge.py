@@ -72,7 +72,7 @@ def merge_recordings(recordings: Sequence[Recording], clock_offsets: Mapping[str
         notes.append(f"all times now count from the first sample, which has the time {begin:.9g} s in its file")
     groups, joints = [(r.name, r.joints) for r in shifted if r.joints is not None], None
     if groups:
-        hint = "import one CSV alone without these columns (--columns NAME=skip), and list the .h5 file in its place"
+        hint = "import one file alone without its joints (--columns 'q_*=skip'), then import the .h5 in its place"
         joints, more = joints_on_fastest_clock(groups, where, hint)
         notes += more
     merged = Recording(

@@ -175,7 +175,8 @@ def copyable_estimates_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIt
         yield f"Not listed, because they are not known well enough: {lost}." if lost else ""
         zero = abbreviated_names_text(use.get("near_zero", ()))
         yield f"Not listed, because they do not differ from zero by more than two ±: {zero}." if zero else ""
-        kinds = {"a configuration of yid-ocp": use["yaml"], "MuJoCo (MJCF)": use["mjcf"], "LaTeX": use["latex"]}
+        mujoco = "MuJoCo (MJCF; only what changes joints, all with export)"
+        kinds = {"a configuration of yid-ocp": use["yaml"], mujoco: use["mjcf"], "LaTeX": use["latex"]}
         model = "a model file" if "yid-ocp export" in use["export"] else "a run with this law"
         for words, lines in (kinds | {model: [use["export"]], "a citation": [use["cite"]]}).items():
             yield f"For {words}:" if lines else ""

@@ -62,8 +62,8 @@ def run_and_return_exit_code(arguments: argparse.Namespace) -> int:
         write_recording(recording, out)
     issues, is_severe = recording_issue_lines(recording)
     result = {"format": _RESULT_FORMAT, "recording": out, **recording_summary_dict(recording), "issues": issues}
-    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml (name all recordings and the object: yid-ocp init "
-    then += f"--help). If there is a configuration already, add {out} to its recordings.estimate"
+    then = f"next: yid-ocp init ROBOT.urdf {out} --out CONFIG.yaml, with your other recordings and the options of the "
+    then += f"object (yid-ocp init --help). If there is a configuration already, add {out} to its recordings.estimate"
     then = DO_NOT_USE.format(out) if is_severe else then
     lines = [*issues, *recording_summary_lines(recording), "", *replaced, then]
     print_result(arguments, result, lambda: lines, f"recording: {out}", out)

@@ -420,7 +420,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             unknown.append(name)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' have the same meaning, {' '.join(own).strip()}"
-            hint = f"leave one out: --columns {name}={base.SKIP_COLUMN_KEYWORD}"
+            hint = f"leave one out (--columns {name}={base.SKIP_COLUMN_KEYWORD}), or name each: 'PREFIX_*=position:*'"
             raise DataError(what, where=where, allowed="one column for every meaning", hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
