@@ -24,7 +24,7 @@ from yid_ocp.report.terminal import summary_blocks
 
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
-    "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
+    "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation", "sensor_noise",
         "covariance", "refinement_notes", "finer_settings", "stability",
     "issues", "torque_offsets", "to_use", "unused_efforts",
 }  # fmt: skip

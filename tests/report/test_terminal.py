@@ -197,8 +197,11 @@ def test_a_held_out_error_far_above_noise_is_said_first(error, noise, fit, said)
     own = "points.p"
     entry = {"recording": "r", "rmse": {own: error}, "baselines": {"stays": {own: 0.03}}, "expected": {own: noise}}
     known = {"residuals": {own: {"rmse": 0.0018, "unit": "m", "n": 9}}, "torque_offsets": {"r": {}}}
-    known["parameters"] = {"a": parameter("identifiable")}
-    text = " ".join(map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known))[:15]))
+    known["parameters"], known["sensor_noise"] = {"a": parameter("identifiable")}, {own: 0.0015}
+    lines = [*map(str.strip, told("yid-solve/1", solved(fit=fit, held_out=[entry], **known)))]
+    text = " ".join(lines[:15])
+    carried = f"noise alone gives 10 mm at {own}, of which the sensor causes 1.5 mm"
+    assert (carried in " ".join(lines)) == (noise > 0.003)
     assert ("You can use these values" in text) == (fit is GOOD and error < 6 * noise)
     assert ("shows a gap" in text, (said or "") in text) == (bool(said), True)
     assert not ("does not explain" in text and "predicts them well" in text)

@@ -516,7 +516,7 @@ def _overlay_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         text = f"The two runs differ {differ} in these parameters: {abbreviated_names_text(differing)}."
     yield SummaryStatement(text, "verdict")
     yield f"The model did not explain the recordings of {', '.join(poor)}." if (poor := result.get("poor")) else ""
-    said = "so a parameter may differ without a fault: the stiffness of a joint grows with the number of links"
+    said = "so a parameter may differ without a fault: the stiffness of a joint (not a rigidity) grows with the links"
     yield f"The models differ ({key}), {said}." if (key := result.get("model_difference")) else ""
     yield SummaryTable(rows, "Estimates of both runs (± is one standard deviation)", is_key_table=True)
     judged = [entry for entry in result["channels"] if entry["held_out"]] or result["channels"]

@@ -1,12 +1,14 @@
-"""Summaries of the results of `inspect`, `export` and `track`, for the terminal and the HTML report."""
+"""Summaries of the results of `inspect`, `export`, `track` and `simulate`, for the terminal and the HTML report."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from yid_ocp.data.channel_checks import QUALITY_LIMITS
 from yid_ocp.display import abbreviated_names_text, count_with_noun, grouped, kind_of_part, names_by_kind_text
+from yid_ocp.errors import FAILED_ROLLOUT_ADVICE
 from yid_ocp.inference.uncertainty import percent_number_text
 from yid_ocp.report import terminal
 
@@ -175,3 +177,18 @@ def _track_summary(result: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIter
     yield from (thing["text"] for thing in result["things"])
     steps = {"estimate the parameters that the configuration frees": "solve --set 'recordings.estimate=[recording.h5]'"}
     yield terminal.next_steps_table(result, {} if result["refused"] else steps)
+
+
+@terminal.SUMMARIES.register("yid-simulate/1")
+def _simulate_summary(result: Mapping[str, Any]) -> terminal.SummaryBlockOrTextIterator:
+    if result["status"] == "failed":
+        said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
+        yield terminal.SummaryStatement(said, "verdict")
+        return
+    said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
+    yield terminal.SummaryStatement(said, "verdict")
+    rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
+    yield terminal.SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
+    option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
+    step = f"solve --set {option} --set 'recordings.held_out=[]'"
+    yield terminal.next_steps_table(result, {"estimate parameters by the same model": step})

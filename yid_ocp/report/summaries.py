@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -224,6 +223,14 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
         said = "An error above twice that of noise alone shows an error of the model"
         said += "." if result["status"] == "converged" else ", or of values whose search has not ended."
     said += " Noise alone includes expected errors of torques, sensors and clocks."
+    levels = result.get("sensor_noise", {})
+    moved = {c: x for e in result["held_out"] for c, x in e.get("expected", {}).items() if x > 2 * levels.get(c, x)}
+    if moved:
+        channel = max(moved, key=lambda name: moved[name] / levels[name])
+        unit = channel_or_group_unit(units, channel)
+        whole, own = (" ".join(value_text_and_display_unit(x[channel], unit)) for x in (moved, levels))
+        said += " Errors of the recorded torques and angles carry the model away: "
+        said += f"noise alone gives {whole} at {channel}, of which the sensor causes {own}."
     yield said if known else ""
 
 
@@ -581,18 +588,3 @@ def _noise_cells(noise: Mapping[str, Any], share: float) -> Iterator[Sequence[st
             source += f" {size}, low-pass filtered, with the noise of the angles"
         if known["std"] is not None:
             yield channel, std, offset * bool(known.get("bias_std")), source
-
-
-@SUMMARIES.register("yid-simulate/1")
-def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlockOrTextIterator:
-    if result["status"] == "failed":
-        said = f"The simulation failed: {result['message']}. If its motion grew, {FAILED_ROLLOUT_ADVICE}."
-        yield SummaryStatement(said, "verdict")
-        return
-    said = f"The file recording.h5 has {result['duration']:g} s of simulated motion. {result['message']}".rstrip()
-    yield SummaryStatement(said, "verdict")
-    rows = [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-    yield SummaryTable([("group of channels", "samples"), *rows], "Simulated readings", is_key_table=True)
-    option = shlex.quote(f"recordings.estimate=[{result.get('file', 'recording.h5')}]")
-    step = f"solve --set {option} --set 'recordings.held_out=[]'"
-    yield next_steps_table(result, {"estimate parameters by the same model": step})

@@ -126,9 +126,9 @@ def solution_to_result_dict(
     """Convert a solution to the contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, _, residuals = estimation.prediction_errors_units_and_fit_rmse(problem, solution, held_out)
     expected = {} if solution.checks is None else solution.checks.expected_prediction_errors
-    levels = {} if problem.has_process_noise else null_test.assumed_noise_rmse_by_channel(problem)
     share = problem.options.excess_residual_criteria.noise_fraction_of_stated_std
-    noise = {channel: share * rmse for channel, rmse in levels.items()}
+    sensor_noise = {c: share * rmse for c, rmse in null_test.assumed_noise_rmse_by_channel(problem).items()}
+    noise = {} if problem.has_process_noise else sensor_noise
     priors = problem.options.prior_stds
     more = {p.name: {"meaning": p.description, "prior_std": priors.get(p.name)} for p in problem.system.parameters}
     return {
@@ -138,6 +138,7 @@ def solution_to_result_dict(
         "parameters": {n: asdict(e) | more[n.split("[")[0]] for n, e in solution.parameters.items()},
         **attributes_to_dict(solution, "cost iterations=n_iterations evaluations=n_evaluations seconds=wall_time"),
         "fit": asdict(solution.goodness_of_fit),
+        "sensor_noise": sensor_noise,
         "residuals": {channel: own | {"expected": noise.get(channel)} for channel, own in residuals.items()},
         "held_out": [e | {"expected": dict(expected.get(e["recording"], {}))} for e in errors[: len(held_out)]],
     }
