@@ -502,6 +502,9 @@ def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder,
     [(_, outcome)], expected = found.checks.held_out_predictions, found.checks.expected_prediction_errors["other"]
     error = np.sqrt(np.mean(np.sum((outcome.predicted_outputs[0] - tip[:, 0]) ** 2, axis=1)) + 3e-6)
     assert expected["points.tip"] == pytest.approx(error, rel=0.25)
+    noisier, said = null_test.problem_with_encoder_noise_in_points(given, fit.x)
+    assert (noisier is not given) == bool(said) == (noise == 2e-3)
+    assert not said or np.sqrt(3) * noisier.options.sensors["points"].std == pytest.approx(error, rel=0.25)
     # the scatter of single draws, of either sign, no longer hides the mean
     assert noise < 1e-3 or shift > 0.3 * (entry.value - 0.02)
     if moved:

@@ -47,6 +47,7 @@ from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
+_NOMINAL_SOLVER = replace(REFIT_SOLVER, cost_tolerance=1e-8)
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
@@ -102,6 +103,13 @@ def diagnose(
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
         problem, earlier = problem_with_priors_and_baseline(problem, baseline)
+        if null_test.encoders_move_object(problem):
+            progress.begin_stage("fitting the nominal model", 3.0, 18.5)
+            solution = solution or fit_problem(problem, _NOMINAL_SOLVER, verdicts=False)
+            problem, noise = null_test.problem_with_encoder_noise_in_points(problem, solution.x)
+            if noise:
+                progress.begin_stage(f"counting noise of encoders as noise of points ({noise})", 3.0, 18.5)
+                solution = fit_problem(problem, _NOMINAL_SOLVER, solution.x.tolist(), verdicts=False)
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         composed = replace(composed, refit_solver=refit_solver)
         deadline = begun + (thresholds.budget or math.inf)
@@ -460,7 +468,7 @@ def fit_nominal_model(
     problem: EstimationProblem, search: RefitContext, solution: Solution | None = None
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
-    solution = solution or fit_problem(problem, replace(REFIT_SOLVER, cost_tolerance=1e-8), verdicts=False)
+    solution = solution or fit_problem(problem, _NOMINAL_SOLVER, verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     composed = search.problem.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(replace(search, problem=composed), start)

@@ -33,6 +33,7 @@ from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
 _N_BIAS_DRAWS = 6  # of encoder noise, for the shifts of estimates
+_MIN_NOISE_GROWTH = 1.05  # of a std, less than which is neglected
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
@@ -192,6 +193,25 @@ def encoder_noise_residual_covariance_factor(
             found.append(np.zeros(len(before)))
             found[-1][at] = (after - before)[at]
     return np.stack(found, axis=1) / np.sqrt(len(found)) if found else nothing
+
+
+def problem_with_encoder_noise_in_points(problem: EstimationProblem, x: Array) -> tuple[EstimationProblem, str]:
+    """Return a problem whose noise of points contains that of encoders which move the object, as at a fit `x` (nx,).
+
+    Also returns a text with the stds of groups of points, empty if none grows by 5 %; then the problem is unchanged.
+    """
+    by_path = encoder_noise_residual_covariance_factor(problem, unknowns_without_encoder_noise_bias(problem, x))
+    rows = grouped((own.group, own.residual_indices) for own in channels_with_residual_indices(problem))
+    growth = {name: 1 + np.sum(by_path[np.concatenate(own)] ** 2, axis=1).mean() for name, own in rows.items()}
+    sensors, said = dict(problem.options.sensors), list[str]()
+    for name, factor in growth.items():
+        if factor > _MIN_NOISE_GROWTH**2:
+            samples = [own for e in problem.episodes for own in e.measurements if own.sensor.group_name == name]
+            std = float(np.nanmedian(np.concatenate([own.std.ravel() for own in samples])))
+            sensors[name] = replace(sensors.get(name, SensorOptions()), std=math.sqrt(factor) * std)
+            said.append(f"{name}: {1e3 * math.sqrt(factor) * std:.2g} mm in place of {1e3 * std:.2g} mm")
+    changed = problem.with_options(replace(problem.options, sensors=sensors)) if said else problem
+    return changed, ", ".join(said)
 
 
 def episodes_with_noisier_motion(problem: EstimationProblem, rng: np.random.Generator) -> list[Episode]:
