@@ -138,6 +138,7 @@ OPENED_ELSEWHERE = {
     "integrator.codegen.kernel_c_source": "sources in C that come with the package",
     "integrator.codegen.kernel_cache_key_text": "sources that come with the package",
     "inference.kalman._library": "a source in C that comes with the package",
+    "workflow.prediction_outputs.copyable_estimate_texts": "the citation that comes with the package",
     "integrator.compiler._machine": "/proc",
     "report.html._packed_script": "the user's own cache",
     "report.html._is_plotly_script": "a script that is compared with its original",
