@@ -199,15 +199,17 @@ def problem_with_encoder_noise_in_points(problem: EstimationProblem, x: Array) -
     """Return a problem whose noise of points contains that of encoders which move the object, as at a fit `x` (nx,).
 
     Also returns a text with the stds of groups of points, empty if none grows by 5 %; then the problem is unchanged.
+    Groups whose std differs between points or times keep it.
     """
     by_path = encoder_noise_residual_covariance_factor(problem, unknowns_without_encoder_noise_bias(problem, x))
     rows = grouped((own.group, own.residual_indices) for own in channels_with_residual_indices(problem))
     growth = {name: 1 + np.sum(by_path[np.concatenate(own)] ** 2, axis=1).mean() for name, own in rows.items()}
     sensors, said = dict(problem.options.sensors), list[str]()
     for name, factor in growth.items():
-        if factor > _MIN_NOISE_GROWTH**2:
-            samples = [own for e in problem.episodes for own in e.measurements if own.sensor.group_name == name]
-            std = float(np.nanmedian(np.concatenate([own.std.ravel() for own in samples])))
+        samples = [own for e in problem.episodes for own in e.measurements if own.sensor.group_name == name]
+        stds = np.concatenate([own.std[own.positive_weight_mask] for own in samples])
+        std = float(np.median(stds))
+        if factor > _MIN_NOISE_GROWTH**2 and np.ptp(stds) < (_MIN_NOISE_GROWTH - 1) * std:
             sensors[name] = replace(sensors.get(name, SensorOptions()), std=math.sqrt(factor) * std)
             said.append(f"{name}: {1e3 * math.sqrt(factor) * std:.2g} mm in place of {1e3 * std:.2g} mm")
     changed = problem.with_options(replace(problem.options, sensors=sensors)) if said else problem
