@@ -22,7 +22,7 @@ from yid_ocp.diagnosis.baseline import EarlierRunsBaseline, problem_with_priors_
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import EventSet, find_events, problem_corrected_for_events
 from yid_ocp.diagnosis.gap_law import find_gap_law
-from yid_ocp.diagnosis.hypotheses import REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll
+from yid_ocp.diagnosis.hypotheses import NOMINAL_SOLVER, REFIT_SOLVER, AllCandidatesProblem, CandidateNamesOrAll
 from yid_ocp.diagnosis.refit import (
     EffectSearchRecord,
     RefitContext,
@@ -47,7 +47,6 @@ from yid_ocp.problem.options import RefinementKind
 from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 _LOG_PROGRESS = LoggingProgress(logging.getLogger(__name__))
-_NOMINAL_SOLVER = replace(REFIT_SOLVER, cost_tolerance=1e-8)
 # of the r'r that a discretisation twice as fine removes: errors of order two leave a third of the change
 _LEFT_BY_DISCRETISATION = 1 / 9
 _LONGEST_FINAL_TIME_STEP = 2e-3  # steps up to this one are never halved, since a forecast may promise too much [s]
@@ -103,13 +102,7 @@ def diagnose(
     with threadpoolctl.threadpool_limits(1):  # threads cost more than they save for small matrices
         begun = time.perf_counter()
         problem, earlier = problem_with_priors_and_baseline(problem, baseline)
-        if null_test.encoders_move_object(problem):
-            progress.begin_stage("fitting the nominal model", 3.0, 18.5)
-            solution = solution or fit_problem(problem, _NOMINAL_SOLVER, verdicts=False)
-            problem, noise = null_test.problem_with_encoder_noise_in_points(problem, solution.x)
-            if noise:
-                progress.begin_stage(f"counting noise of encoders as noise of points ({noise})", 3.0, 18.5)
-                solution = fit_problem(problem, _NOMINAL_SOLVER, solution.x.tolist(), verdicts=False)
+        problem, solution = hypotheses.fit_with_encoder_noise_in_points(problem, solution, progress)
         composed = hypotheses.make_all_candidates_problem(problem, candidates, exclude, held_out, progress)
         composed = replace(composed, refit_solver=refit_solver)
         deadline = begun + (thresholds.budget or math.inf)
@@ -468,7 +461,7 @@ def fit_nominal_model(
     problem: EstimationProblem, search: RefitContext, solution: Solution | None = None
 ) -> RefittedModel:
     """Fit the nominal model in the problem that contains all candidate effects. Raises `SolverError` on failure."""
-    solution = solution or fit_problem(problem, _NOMINAL_SOLVER, verdicts=False)
+    solution = solution or fit_problem(problem, NOMINAL_SOLVER, verdicts=False)
     start = dict(zip(solution.unknown_names, map(float, solution.x), strict=True))
     composed = search.problem.with_smoothed_input_errors_of(solution.problem)
     return _fitted_nominal_model(replace(search, problem=composed), start)

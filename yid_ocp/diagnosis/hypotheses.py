@@ -15,6 +15,7 @@ from yid_ocp.display import Progress, count_with_noun
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects.friction import lower_smoothing_speed_to_joint_min
 from yid_ocp.errors import ConfigError, DataError, SolverError, unknown_name_error_arguments
+from yid_ocp.inference import null_test
 from yid_ocp.inference.whitening import (
     WhiteningFilter,
     problem_relinearized_at_torque_bias,
@@ -31,10 +32,11 @@ from yid_ocp.problem.evaluation import ProcessNoiseWhitener
 from yid_ocp.problem.measurements import SensorMeasurements
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.recorded_inputs import recorded_signal_kinds
-from yid_ocp.solvers import GaussNewton
+from yid_ocp.solvers import GaussNewton, Solution, fit_problem
 
 CandidateNamesOrAll = Literal["all"] | Sequence[str]
 REFIT_SOLVER = GaussNewton(max_iterations=25).with_coarse_tolerances  # good to a part of a std
+NOMINAL_SOLVER = replace(REFIT_SOLVER, cost_tolerance=1e-8)
 
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
 _MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
@@ -321,6 +323,24 @@ class AllCandidatesProblem:
         if not own.has_process_noise:
             return own
         return problem_with_reestimated_held_out_torque_biases(own, *_beside(own, effects, at))
+
+
+def fit_with_encoder_noise_in_points(
+    problem: EstimationProblem, solution: Solution | None, progress: Progress
+) -> tuple[EstimationProblem, Solution | None]:
+    """Return the problem whose noise of points contains that of encoders that move the object, and its nominal fit.
+
+    Without such noise, the problem and the `solution` of the nominal model are returned unchanged.
+    """
+    if not null_test.encoders_move_object(problem):
+        return problem, solution
+    progress.begin_stage("fitting the nominal model", 3.0, 18.5)
+    solution = solution or fit_problem(problem, NOMINAL_SOLVER, verdicts=False)
+    noisier, said = null_test.problem_with_encoder_noise_in_points(problem, solution.x)
+    if not said:
+        return problem, solution
+    progress.begin_stage(f"counting noise of encoders as noise of points ({said})", 3.0, 18.5)
+    return noisier, fit_problem(noisier, NOMINAL_SOLVER, solution.x.tolist(), verdicts=False)
 
 
 def make_all_candidates_problem(
