@@ -473,7 +473,7 @@ def test_noise_of_the_angles_that_move_an_object_widens_its_damping(urdf_folder,
     robot, springs = read_urdf(urdf_folder / "double_pendulum.urdf"), {"elbow": StiffnessAndRest(60.0)}
     how = {"springs": springs, "damping": {"shoulder": 0.0, "elbow": 0.02}, "prescribed": ["shoulder"]}
     system = System.build(robot, point_frames=["tip"], **how)
-    step, t = compile_step(system, 0.005, use_compiler=False), 0.005 * np.arange(801)
+    step, t = compile_step(system, 0.005), 0.005 * np.arange(801)
     path = (0.25 * (np.tanh(8 * (t - 0.6)) + np.tanh(4.8)) + 0.3 * np.sin(2 * t) * np.minimum(1, t) ** 2)[:, None]
     rollout = simulate(step, system.parameters.vector(), np.zeros(step.sizes["nx"]), 800, path=path)
     rng = np.random.default_rng(1)
