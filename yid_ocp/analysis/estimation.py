@@ -340,12 +340,12 @@ def _predict_held_out_with_expected_errors(
                 other = replace(episode, input_errors=moved)
                 drawn.append(predict(other, theta, offset, False, outcome.equilibrium_guess))
         changes = _prediction_changes(outcome, drawn)
-        if encoders_move_object(problem):
+        # stated errors of efforts contain the noise of encoders already
+        kept = [not samples.sensor.effort_joints for samples in episode.measurements]
+        if any(kept) and encoders_move_object(problem):
             theta = held_out_parameter_vector(problem, unbiased, episode)
             noisy = (episode_with_noisier_motion(episode, problem, rng) for _ in range(_N_ERROR_DRAWS))
             base, *drawn = (predict(own, theta, offset, False, outcome.equilibrium_guess) for own in (episode, *noisy))
-            # stated errors of efforts contain the noise of encoders already
-            kept = [not samples.sensor.effort_joints for samples in episode.measurements]
             moves = [] if isinstance(base, str) else _prediction_changes(base, drawn)
             changes += [[change * own for change, own in zip(move, kept, strict=True)] for move in moves]
         errors_of_stated_stds = _expected_errors(episode, outcome, changes).items()

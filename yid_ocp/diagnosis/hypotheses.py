@@ -39,7 +39,6 @@ REFIT_SOLVER = GaussNewton(max_iterations=25).with_coarse_tolerances  # good to 
 NOMINAL_SOLVER = replace(REFIT_SOLVER, cost_tolerance=1e-8)
 
 _BLOCK_DURATION = 1.0  # of the blocks into which a recording is split if none is held out, at most a third of it [s]
-_MIN_NOISE_GROWTH = 1.05  # of efforts beside effects from which weights are computed anew
 _MIN_PREDICTED_DURATION = 1.0  # shortest part of a truncated held-out recording that is kept [s]
 KEPT_HELD_OUT_FRACTIONS = (0.9, 0.5, 0.0)
 """Fractions of the duration until the simulation of a held-out recording fails, of which it keeps one. All are below 1,
@@ -266,7 +265,7 @@ class AllCandidatesProblem:
         pairs = zip(now.episodes, made.episodes, strict=True)
         samples = (own for before, after in pairs for own in zip(before.measurements, after.measurements, strict=True))
         growth = [np.nanmedian(new.std / old.std, axis=0).max() for old, new in samples if old.sensor.effort_joints]
-        is_noisier = max(growth, default=1.0) > _MIN_NOISE_GROWTH
+        is_noisier = max(growth, default=1.0) > null_test.MIN_NOISE_GROWTH
         return replace(self, problem=made, held_out_spread=None) if is_noisier else None
 
     def truncate_failing_held_out_recordings(

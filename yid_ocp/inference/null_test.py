@@ -33,10 +33,10 @@ from yid_ocp.sensors.signal_filters import ZeroPhaseLowPassFilter
 _RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 _N_PATH_NOISE_DRAWS, _N_FOLDS = 32, 8  # draws of encoder noise (the variance of a score to a quarter), and their folds
 _N_BIAS_DRAWS = 6  # of encoder noise, for the shifts of estimates
-_MIN_NOISE_GROWTH = 1.05  # of a std, less than which is neglected
 _BLOCK_DURATIONS = (0.5, 2.0)  # shortest and longest held-out time blocks, about forty in all [s]
 _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
+MIN_NOISE_GROWTH = 1.05  # of a std by encoder noise, less than which is neglected
 EXTRAPOLATION_FACTOR = 2.0
 """Distance to many links, short steps or no encoder noise, over the shift of one refinement: m + m/2 + m/4 + ..."""
 
@@ -154,14 +154,15 @@ def unknown_shifts_by_more_encoder_noise(problem: EstimationProblem, x: Array) -
 
 
 def unknowns_without_encoder_noise_bias(problem: EstimationProblem, x: Array) -> Array:
-    """Return a fit `x` (nx,) without the shift by encoder noise, at most halfway to bounds.
+    """Return a fit `x` (nx,) without the shift by encoder noise, at most halfway to bounds; `x` without points.
 
     Damping that is estimated too large hides how far the noise of encoders moves the object.
     """
-    moves = unknown_shifts_by_more_encoder_noise(problem, x)
+    has_points = any(episode.recording.points for episode in problem.episodes)
+    moves = unknown_shifts_by_more_encoder_noise(problem, x) if has_points else ()
     if not len(moves):
         return x
-    return np.clip(x - EXTRAPOLATION_FACTOR * moves.mean(axis=0), *((x + bound) / 2 for bound in problem.bounds))
+    return np.clip(x - EXTRAPOLATION_FACTOR * np.mean(moves, axis=0), *((x + bound) / 2 for bound in problem.bounds))
 
 
 def encoders_move_object(problem: EstimationProblem) -> bool:
@@ -209,7 +210,7 @@ def problem_with_encoder_noise_in_points(problem: EstimationProblem, x: Array) -
         samples = [own for e in problem.episodes for own in e.measurements if own.sensor.group_name == name]
         stds = np.concatenate([own.std[own.positive_weight_mask] for own in samples])
         std = float(np.median(stds))
-        if factor > _MIN_NOISE_GROWTH**2 and np.ptp(stds) < (_MIN_NOISE_GROWTH - 1) * std:
+        if factor > MIN_NOISE_GROWTH**2 and np.ptp(stds) < (MIN_NOISE_GROWTH - 1) * std:
             sensors[name] = replace(sensors.get(name, SensorOptions()), std=math.sqrt(factor) * std)
             said.append(f"{name}: {1e3 * math.sqrt(factor) * std:.2g} mm in place of {1e3 * std:.2g} mm")
     changed = problem.with_options(replace(problem.options, sensors=sensors)) if said else problem
